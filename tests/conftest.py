@@ -3,6 +3,7 @@
 import gc
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -14,6 +15,7 @@ from models import registry
 from models.registry import DENOISERS, prototype
 from models.spec import DenoiserSpec
 from render.backend import mi
+from render.scene_file.load import own_scene
 from render.stage import Stage
 from scenes.registry import build_scene
 from tests.helpers.datasets import generate_tiny
@@ -45,6 +47,13 @@ def kernels() -> None:
     for name in names if worker == "gw0" else reversed(names):
         compile_kernels(DenoiserSpec.named(name))
     all_compiled.touch()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_scene_is_left() -> Iterator[None]:
+    """What is loaded enters all kernels: those of the next file would be compiled anew."""
+    yield
+    own_scene.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ from tests.helpers.other_device import Other, other_device
 
 WRAPPED = ("svgf+js", "wskp6+adaptive", "ntd+taa")
 FRAMES = [synthetic_frame(index, 24, 32) for index in range(2)]
-OFTEN = ("accumulated", "svgf", "wskp6", "ntd", "rae", "one", "svgf+js")
+OFTEN = ("accumulated", "wskp6", "ntd", "rae", "one")
 NAMES = [*(name for name in DENOISERS if "oidn" not in name), *WRAPPED]
 
 

@@ -6,8 +6,12 @@ import time
 from pathlib import Path
 from typing import Any
 
+from datasets.channels import CHANNELS
 from models.registry import DENOISERS, channels_read
 from render.job.generate import generate
+
+# All but those for which Dr.Jit traces further paths in every frame.
+MOST_CHANNELS = tuple(name for name in CHANNELS if CHANNELS[name].step not in ("hit_distance", "shadow_motion"))
 
 
 def dataset_command(root: Path) -> list[str]:

@@ -8,7 +8,15 @@ from scenes.colours import Bsdf
 
 SIZE = (48, 64)
 FRAMES = 3
-SILVER = {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}}
+
+
+def mirror(*reflectance: float) -> Bsdf:
+    """On both sides. All of these are of the same kernels."""
+    inside = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "rgb", "value": [*reflectance]}}
+    return {"type": "twosided", "bsdf": inside}
+
+
+SILVER = mirror(1.0, 1.0, 1.0)
 
 
 def painted(red: float) -> Bsdf:

@@ -37,21 +37,22 @@ def posed_surfaces(stage: Stage, frame: int) -> tuple[View, View, Array, NDArray
     return now, previous, depth, mesh_id, motion_vectors(centres, depth, mesh_id, now, previous)
 
 
-def stock_radiance(stage: Stage, max_depth: int, spp: int, seed: int) -> NDArray[np.float32]:
-    """Mean radiance (H, W, 3), emission included, by Mitsuba's own path tracer through our pixel-centre rays.
+def stock_images(stage: Stage, max_depth: int, count: int, spp: int = 16, seed: int = 0) -> NDArray[np.float32]:
+    """Radiance (N, H, W, 3), emission included, by Mitsuba's own path tracer through our pixel-centre rays.
 
-    The stage must be posed for POSED_FRAME.
+    `count` independent images at once, since tracing the kernel takes longer than running it. The stage must be posed
+    for POSED_FRAME.
     """
-    count = stage.height * stage.width
+    pixels = stage.height * stage.width
     sampler = mi.load_dict({"type": "independent", "sample_count": spp})
-    sampler.seed(seed, count * spp)
+    sampler.seed(seed, count * pixels * spp)
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
     ray = stage.rays(stage.view(POSED_FRAME))
-    pixel = dr.arange(mi.UInt32, count * spp) // spp
-    ray.o = ray.o + dr.zeros(mi.Point3f, count)  # one eye for all, or a point behind cut-outs for each
+    pixel = dr.arange(mi.UInt32, count * pixels * spp) // spp % pixels
+    ray.o = ray.o + dr.zeros(mi.Point3f, pixels)  # one eye for all, or a point behind cut-outs for each
     ray = mi.RayDifferential3f(dr.gather(mi.Ray3f, ray, pixel))
     colour, _, _ = integrator.sample(stage.mitsuba_scene, sampler, ray)
-    return np.array(colour).T.reshape(stage.height, stage.width, spp, 3).mean(axis=2)
+    return np.array(colour).T.reshape(count, stage.height, stage.width, spp, 3).mean(axis=3)
 
 
 def block_means(images: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -15,6 +15,7 @@ from models.filters import bmfr
 from models.filters.baselines import Accumulated
 from models.filters.bmfr import BMFR, Blocks
 from tests.helpers.frames import chain, flat_frame, play, run
+from tests.models.conftest import IMPLEMENTATIONS
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 EXAMPLES = settings(deadline=None)
@@ -110,12 +111,13 @@ def fitted_by_numpy(light, normal, depth, axes, noise, offset):
 
 @EXAMPLES
 @given(size=SIZES, offset=OFFSETS, share=st.sampled_from([0.0, 0.003, 0.05, 0.8, 1.0]), seed=st.integers(0, 9999))
-@pytest.mark.usefixtures("implementation")
 def test_blocks_are_fitted_as_numpy_does(size, offset, share, seed):
     image = scene(np.random.default_rng(seed), *size, share)
     noise = bmfr.feature_noise(seed)
     expected = fitted_by_numpy(*image, noise.numpy(), offset)
-    np.testing.assert_allclose(regress(*image, noise, offset), expected, rtol=1e-5, atol=1e-5)
+    for implementation in IMPLEMENTATIONS.values():
+        with implementation():
+            np.testing.assert_allclose(regress(*image, noise, offset), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_noise_is_small_of_mean_0_and_always_the_same():

@@ -104,7 +104,10 @@ def test_indirect_light_alone_is_filtered_as_in_the_total(name):
     torch.testing.assert_close(indirect, run(total, dark))
 
 
-@pytest.mark.parametrize("name, share", [("svgf", 0.3), ("eaw", 0.3), ("bmfr", 0.02), ("nfor", 0.3)])
+@pytest.mark.parametrize(
+    "name, share",
+    [("svgf", 0.3), ("eaw", 0.3), ("bmfr", 0.02), pytest.param("nfor", 0.3, marks=pytest.mark.slow)],
+)
 def test_noise_on_a_wall_is_gone(name, share):
     """Of the error after accumulation alone."""
     generator = torch.Generator().manual_seed(0)

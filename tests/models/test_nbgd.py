@@ -69,7 +69,7 @@ def test_the_kernel_equals_pytorch_in_many_strips(spacing):
         torch.testing.assert_close(fast, grid_mean(image, guide, spacing), rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("spacing", [4, 16])
+@pytest.mark.parametrize("spacing", [4, pytest.param(16, marks=pytest.mark.slow)])
 def test_gradients_are_those_of_finite_differences(spacing):
     image, guide, surface = (tensor.double() for tensor in random_inputs(1, 5, 6))
     image.requires_grad_()

@@ -16,6 +16,7 @@ from models.history.reprojection import reproject
 from models.networks.one import One
 from tests.helpers.frames import chain, flat_frame, play, prepared, run
 from tests.helpers.unfold import taps
+from tests.models.conftest import MOSTLY_KERNELS
 
 SIZE = (24, 40)
 BYTES_AT_720P = 150e6
@@ -178,12 +179,13 @@ def test_the_brightest_pixel_with_the_largest_weight_stays_finite(fresh):
 
 
 @pytest.mark.usefixtures("implementation")
+@MOSTLY_KERNELS
 @pytest.mark.parametrize("name", BOUNDED)
 def test_surfaces_count_as_at_most_100(fresh, name):
     """In a tenth of the pixels, also where a channel's sum shows nothing."""
     hit = torch.rand(1, 1, *SIZE, generator=torch.Generator().manual_seed(2)) < 0.1
     sequence = [synthetic_frame(index, *SIZE) for index in range(4)]
-    for value in (1e35, -1e35, 3e38, torch.tensor([1e35, -1e35]).repeat(SIZE[1] // 2)):
+    for value in (1e35, -1e35, torch.tensor([1e35, -1e35]).repeat(SIZE[1] // 2)):
         huge = torch.as_tensor(value)
         outputs, expected = (
             run(fresh, [frame.with_channels({name: torch.where(hit, x, frame.channel(name))}) for frame in sequence])

@@ -12,6 +12,7 @@ from models.filters.neighbours import mesh_variance
 from models.filters.sbf import BANK, best_filtered, filter_with_risk, guides
 from models.registry import create
 from tests.helpers.frames import chain, flat_frame, run
+from tests.models.conftest import MOSTLY_KERNELS
 
 pytestmark = pytest.mark.usefixtures("implementation")
 
@@ -75,6 +76,7 @@ def test_windows_larger_than_a_strip_of_rows():
             np.testing.assert_allclose(filtered[0, s, :, *p], expected, rtol=1e-5)
 
 
+@MOSTLY_KERNELS
 def test_the_risk_is_the_squared_error_on_average():
     """Over many images of the same truth: an edge in the features, one that is not, and noise that grows."""
     generator = torch.Generator().manual_seed(0)

@@ -17,6 +17,7 @@ from models.history.running_scale import running_scale
 from models.networks.wskp import network_features
 from models.spec import load
 from models.weights import read_metadata, save_weights
+from tests.helpers.denoisers import each
 from tests.helpers.frames import chain, flat_frame, run
 
 GREY = [0.25, 0.5, 0.75]
@@ -92,7 +93,7 @@ def test_the_output_is_the_general_one_s_but_near_the_border(name, border):
         assert not torch.allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", LEFT_OUT)
+@pytest.mark.parametrize("name", each(LEFT_OUT))
 def test_every_network_can_do_without_what_does_not_vary(name, tmp_path):
     """Also after a way through a file, in the form for inference, compiled and not."""
     general, special = pair(name, LEFT_OUT[name])

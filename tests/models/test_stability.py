@@ -27,6 +27,7 @@ from tests.helpers.frames import chain, flat_frame, play, prepared, run
 WRAPPED = ("noisy+taa", "noisy+accumulated", "wskp3+taa", "eaw+adaptive", "wskp3+adaptive", "eaw+js")
 NAMES = [name for name in (*registry.DENOISERS, *WRAPPED) if not registry.prototype(name).unavailable()]
 FILTERS = ("eaw", "svgf", "asvgf", "trmv", "bmfr", "aaf", "sbf")  # those without a network that run in real time
+LIKE_OTHERS = ("wskp6", "wskp3+adaptive", "wskp3+taa")  # slow, as they share the code of others below
 pytestmark = pytest.mark.usefixtures("one_thread")
 ALL = tuple(registry.channels_read())
 
@@ -80,7 +81,7 @@ def frames_strategy(draw, longest=4, largest=19):
 SETTINGS = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
-@pytest.mark.parametrize("name", each(NAMES))
+@pytest.mark.parametrize("name", each(NAMES, *LIKE_OTHERS))
 @SETTINGS
 @given(frames=frames_strategy())
 def test_finite_in_finite_out_and_nothing_below_zero(denoisers, name, frames):
@@ -90,7 +91,7 @@ def test_finite_in_finite_out_and_nothing_below_zero(denoisers, name, frames):
         assert (output >= 0).all()
 
 
-@pytest.mark.parametrize("name", each(name for name in NAMES if name != "noisy"))
+@pytest.mark.parametrize("name", each((name for name in NAMES if name != "noisy"), *LIKE_OTHERS))
 @SETTINGS
 @given(
     frames=frames_strategy(),
@@ -113,7 +114,7 @@ def test_a_poisoned_pixel_counts_as_zero(denoisers, name, frames, poison, channe
     torch.testing.assert_close(poisoned, black, rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("name", each(name for name in NAMES if registry.prototype(name).convex))
+@pytest.mark.parametrize("name", each((name for name in NAMES if registry.prototype(name).convex), *LIKE_OTHERS))
 @SETTINGS
 @given(frames=frames_strategy())
 def test_convex_filters_stay_in_range(denoisers, name, frames):
@@ -136,7 +137,7 @@ def noisy_sequence(count: int, size: int = 8):
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(10_000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", each(NAMES))
+@pytest.mark.parametrize("name", each(NAMES, *LIKE_OTHERS))
 def test_long_sequences_stay_bounded(denoisers, name, count):
     """Offline denoisers, which have no history, get a tenth."""
     outputs, state = play(denoisers[name], noisy_sequence(count // 10 if denoisers[name].offline else count))
@@ -154,7 +155,7 @@ def shown_psnr(images, others, exposure) -> float:
 
 
 @pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("name", each(NAMES, "rae", "ntd"))
+@pytest.mark.parametrize("name", each(NAMES, "rae", "ntd", *LIKE_OTHERS))
 def test_half_precision_is_close_on_real_frames_or_refused_with_a_reason(tiny, name, precision):
     half = registry.create(name)
     if precision in half.refuses:
@@ -183,7 +184,7 @@ def sequence(clip, start: int, count: int) -> list[Frame]:
     return [read_frame(clip, index, ALL, window=window) for index in range(start, start + count)]
 
 
-@pytest.mark.parametrize("name", each(NAMES))
+@pytest.mark.parametrize("name", each(NAMES, *LIKE_OTHERS))
 def test_a_scene_cut_resets_the_history(tiny, denoisers, name):
     """Frames of another place in the middle of a sequence come out as if they were the first."""
     here, there = Dataset(tiny).clips("test")[:2]
@@ -193,7 +194,7 @@ def test_a_scene_cut_resets_the_history(tiny, denoisers, name):
     torch.testing.assert_close(cut, run(denoisers[name], after), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("name", each(NAMES))
+@pytest.mark.parametrize("name", each(NAMES, *LIKE_OTHERS))
 def test_preparing_twice_changes_nothing(name):
     denoiser = prepared(name)
     frame = flat_frame(9, 7)
@@ -223,7 +224,7 @@ def test_a_thousand_times_the_light_is_a_thousand_times_the_output(name):
 
 
 @pytest.mark.parametrize("name", ["accumulated", *FILTERS])
-@pytest.mark.parametrize("signal", ["total", "indirect"])
+@pytest.mark.parametrize("signal", ["total", pytest.param("indirect", marks=pytest.mark.slow)])
 def test_kernels_and_pytorch_agree(name, signal):
     frames = [synthetic_frame(index, 41, 70) for index in range(4)]
     denoiser = registry.create(name, signal)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from datasets.channels import MIRRORED, SECOND, SECOND_LAYER, USUAL_CHANNELS
+from datasets.channels import MIRRORED, SECOND, SECOND_LAYER
 from datasets.clip import Clip
 from datasets.frame import read_frame
 from render.clip import Arrays, Sampling, render_clip
@@ -19,11 +19,12 @@ from scenes.camera import FAR_OUTSIDE, pixel_centres
 from scenes.colours import Bsdf
 from scenes.glass import GLASS_SCENES
 from tests.datasets.test_mirrors import assert_the_same_from_exr, clip_of
+from tests.helpers.datasets import MOST_CHANNELS
 from tests.helpers.mirrors import BOX, FRAMES, GLIDE, SILVER, SIZE, painted, panel, placed, room
 from tests.render.test_look_through import SURFACE, rendered
 from tests.render.test_specular import GLASS, THIN, reflectances
 
-WITH_LAYERS = (*USUAL_CHANNELS, *SECOND_LAYER)
+SPP = 16
 
 
 def with_picture(surface: Bsdf) -> Scene:
@@ -36,7 +37,7 @@ def with_picture(surface: Bsdf) -> Scene:
 
 @pytest.fixture(scope="module")
 def pane() -> list[Arrays]:
-    return rendered(with_picture(THIN), spp=64)
+    return rendered(with_picture(THIN), spp=SPP)
 
 
 def assert_same_surfaces(frame: Arrays, forms: dict[str, str], other: Arrays, names: dict[str, str]) -> None:
@@ -83,12 +84,13 @@ def test_samples_take_the_second_layer_by_fresnels_equations(pane):
     reflectance = pane[0]["glass_reflectance"][..., 0]
     np.testing.assert_allclose(reflectance[picture], expected[picture], rtol=1e-3)
     drawn = pane[0]["second_samples"][0, ..., 0][picture]
-    error = np.sqrt((expected * (1 - expected) / 64)[picture])
+    error = np.sqrt((expected * (1 - expected) / SPP)[picture])
     assert abs((drawn - expected[picture]).mean()) < 4 * np.sqrt((error**2).sum()) / len(error)
 
 
-def test_the_light_of_the_second_layer_is_that_of_a_mirror_times_reflectance(pane):
-    mirror = rendered(with_picture(SILVER), spp=64)
+@pytest.mark.slow
+def test_the_light_of_the_second_layer_is_that_of_a_mirror_times_reflectance():
+    pane, mirror = (rendered(with_picture(surface), spp=64) for surface in (THIN, SILVER))
     seconds, expected = [], []
     for frame, other in zip(pane, mirror, strict=True):
         picture = frame["mesh_id"][..., 0] == 1
@@ -137,12 +139,12 @@ def test_motion_through_a_ball_leads_to_the_same_light():
 
 @pytest.mark.parametrize("surface", [{"type": "roughdielectric", "alpha": 0.2}, {"type": "plastic"}, painted(0.5)])
 def test_what_is_no_smooth_glass_has_one_layer(surface):
-    assert not set(SECOND_LAYER) & rendered(with_picture(surface))[0].keys()
+    assert Stage(with_picture(surface), *SIZE).glass is None
 
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory) -> Clip:
-    return clip_of(with_picture(THIN), tmp_path_factory.mktemp("glass"), WITH_LAYERS)
+    return clip_of(with_picture(THIN), tmp_path_factory.mktemp("glass"), MOST_CHANNELS)
 
 
 def test_only_clips_that_show_glass_have_its_channels(clip, tmp_path):
@@ -150,7 +152,7 @@ def test_only_clips_that_show_glass_have_its_channels(clip, tmp_path):
     assert of_layers <= clip.channels.keys()
     plain = room(painted(0.5))
     hidden = Shape("pane out of sight", placed(panel(0.1, 0.1), [0, 0, 50]), THIN)
-    other = clip_of(replace(plain, shapes=(*plain.shapes, hidden)), tmp_path, WITH_LAYERS)
+    other = clip_of(replace(plain, shapes=(*plain.shapes, hidden)), tmp_path, MOST_CHANNELS)
     assert not of_layers & other.channels.keys()
     assert not [*other.path.glob("second*"), *other.path.glob("mirrored*")]
 

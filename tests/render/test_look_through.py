@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from datasets.channels import SECOND_LAYER
 from provenance import ROOT
 from render.clip import Arrays, Sampling, render_clip
 from render.gbuffer import render_gbuffer
@@ -14,7 +15,7 @@ from render.look_through import MAX_BLUR
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 from scenes.camera import pixel_centres, unproject
-from tests.helpers.mirrors import CAMERA, FRAMES, HAND_MIRROR, SILVER, SIZE, painted, panel, placed, room
+from tests.helpers.mirrors import CAMERA, FRAMES, HAND_MIRROR, SILVER, SIZE, mirror, painted, panel, placed, room
 from tests.helpers.rendering import first_gbuffer, rgb
 from tests.helpers.scene_files import own
 
@@ -47,7 +48,10 @@ def show_themselves(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def rendered(scene: Scene, spp: int = 1) -> list[Arrays]:
-    return [frame for frame, _ in render_clip(scene, FRAMES, *SIZE, Sampling(1, spp, 2), seed=3)]
+    """What is visible, its light and its motion."""
+    channels = (*SURFACE, "mesh_id", "motion", "direct", "indirect", *SECOND_LAYER)
+    frames = render_clip(scene, FRAMES, *SIZE, Sampling(1, spp, 2), seed=3, channels=channels)
+    return [frame for frame, _ in frames]
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +82,7 @@ def test_elsewhere_all_is_as_it_is(visible):
 
 
 METALS = [{"type": "roughconductor", "material": "Ag", "alpha": 0.3}, {"type": "conductor", "material": "Ag"}]
-OTHERS = [painted(0.5), {"type": "dielectric"}, {"type": "plastic"}, *METALS]
+OTHERS = [painted(0.5), {"type": "plastic", "diffuse_reflectance": rgb(0.5, 0.5, 0.5)}, *METALS]
 
 
 @pytest.mark.parametrize("surface", OTHERS, ids=lambda bsdf: bsdf["type"])
@@ -108,14 +112,15 @@ def test_a_glossy_surface_shows_what_it_shows_sharply():
 
 
 def test_a_mirror_that_shows_the_sky_is_a_mirror():
-    buffer = show_themselves(Scene((Shape("mirror", panel(20, 20), SILVER),), CAMERA))
+    picture, *others = room(SILVER).shapes
+    out_of_sight = (replace(shape, mesh=placed(shape.mesh, [0, 0, -1000])) for shape in others)
+    buffer = show_themselves(Scene((replace(picture, mesh=panel(20, 20)), *out_of_sight), CAMERA))
     assert buffer["mesh_id"].mean() > 0.6
 
 
 def test_a_tinted_mirror_tints_albedo():
     """By its reflectance at normal incidence, the more often the more mirrors there are."""
-    gold = {"type": "conductor", "material": "none", "specular_reflectance": rgb(0.9, 0.6, 0.3)}
-    buffer = first_gbuffer(room(gold), *SIZE)
+    buffer = first_gbuffer(room(mirror(0.9, 0.6, 0.3)), *SIZE)
     behind_glass = buffer["mirrored_mesh_id"][..., 0] == 3
     assert behind_glass.any()
     tints = buffer["mirrored_albedo"][behind_glass] / [0.7, 0.4, 0.6]

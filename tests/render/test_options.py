@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from render.backend import mi
 from render.clip import Options, Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.path import PathTracer
@@ -14,7 +15,7 @@ from render.stage import Stage
 from scenes.animation import StockShape, frozen
 from scenes.cornell import repaint
 from scenes.registry import build_scene
-from tests.helpers.rendering import POSED_FRAME, assert_same_mean, rgb, stock_radiance
+from tests.helpers.rendering import POSED_FRAME, assert_same_mean, rgb, stock_images
 
 
 @pytest.mark.slow
@@ -22,7 +23,7 @@ def test_every_point_of_the_halton_cycle_is_unbiased(stage, rays):
     tracer = PathTracer(stage, halton=True)
     images = np.stack([np.add(*tracer.radiance(rays, seed, 1, first=seed)) for seed in range(50 * CYCLE)])
     emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"]
-    assert_same_mean(emission + images, np.stack([stock_radiance(stage, 3, 16, s) for s in range(30)]))
+    assert_same_mean(emission + images, stock_images(stage, 3, 30))
 
 
 @pytest.mark.slow
@@ -56,6 +57,7 @@ def test_rarely_sampled_lights_change_noisy_frames_alone():
         assert not changed & {"direct_reference", "indirect_reference", "emission"}
 
 
+@pytest.mark.slow
 def test_regularisation_changes_nothing_where_nothing_is_glossy(stage, rays):
     plain = PathTracer(stage).radiance(rays, 1, 4)
     regular = PathTracer(stage, regularise=True).radiance(rays, 1, 4)
@@ -132,8 +134,23 @@ def stage_with_instance(bsdf):
     return Stage(replace(box, stock=(*box.stock, ball)), 32, 32)
 
 
-@pytest.mark.parametrize("bsdf", [None, {"type": "diffuse", "reflectance": rgb(0.9, 0.1, 0.1)}])
+BALLS = pytest.mark.parametrize("bsdf", [None, {"type": "diffuse", "reflectance": rgb(0.9, 0.1, 0.1)}])
+
+
+@BALLS
 def test_instances_keep_their_material(bsdf):
+    stage = stage_with_instance(bsdf)
+    si = stage.mitsuba_scene.ray_intersect(stage.rays(stage.view(0)))
+    table = BlurredTable(stage)
+    bsdfs = (si.bsdf(), table.after_first(si, mi.UInt32(2)))
+    colours = [stage.image(bsdf.eval_diffuse_reflectance(si)) for bsdf in bsdfs]
+    assert np.array_equal(*colours)
+    assert np.isclose(colours[0], bsdf["reflectance"]["value"] if bsdf else 0.5).all(axis=-1).sum() > 50
+
+
+@pytest.mark.slow
+@BALLS
+def test_instances_of_diffuse_balls_keep_their_light(bsdf):
     stage = stage_with_instance(bsdf)
     ray = stage.rays(stage.view(0))
     plain, regular = (PathTracer(stage, regularise=r).radiance(ray, 1, 16) for r in (False, True))

@@ -8,7 +8,9 @@ import pytest
 from render.backend import VARIANT, dr
 from render.path import PosedFrame
 from render.stage import Stage
+from scenes.colours import bitmap, diffuse_bsdf
 from scenes.registry import build_scene
+from tests.render.test_materials import textured_square
 
 LARGE = 3000  # operations; G-buffer and path tracing have several times as many, what prepares data has far fewer
 
@@ -35,16 +37,12 @@ def test_scenes_share_their_kernels():
 
 
 def test_placement_of_textures_moves_into_texture_coordinates():
-    scene = build_scene("room-1", 0, 4)
-    textured = [
-        (before, after)
-        for before, after in zip(scene.shapes, Stage(scene, 8, 8).scene.shapes, strict=True)
-        if before.bsdf.get("reflectance", {}).get("type") == "bitmap"
-    ]
-    assert textured
-    for before, after in textured:
-        placement = before.bsdf["reflectance"]["to_uv"]
-        expected = before.mesh.visual.uv @ placement[:2, :2].T + placement[:2, 2]
-        np.testing.assert_allclose(after.mesh.visual.uv, expected)
-        assert "to_uv" not in after.bsdf["reflectance"]
-        assert (after.mesh.vertex_normals == before.mesh.vertex_normals).all()
+    placement = np.array([[0.0, 2.0, 0.3], [-3.0, 0.0, 0.1], [0, 0, 1]])
+    scene = textured_square(diffuse_bsdf(bitmap(np.full((2, 2, 3), 0.5, np.float32)) | {"to_uv": placement}))
+    (square,) = scene.shapes
+    square.mesh.vertex_normals = np.tile([0.6, 0, 0.8], (4, 1))
+    (placed,) = Stage(scene, 8, 8).scene.shapes
+    expected = square.mesh.visual.uv @ placement[:2, :2].T + placement[:2, 2]
+    np.testing.assert_allclose(placed.mesh.visual.uv, expected)
+    assert "to_uv" not in placed.bsdf["reflectance"]
+    assert (placed.mesh.vertex_normals == [0.6, 0, 0.8]).all()

@@ -12,7 +12,7 @@ from render.stage import Stage
 from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
 from scenes.cornell import repaint
 from scenes.registry import build_scene
-from tests.helpers.rendering import POSED_FRAME, assert_same_mean, stock_radiance
+from tests.helpers.rendering import POSED_FRAME, assert_same_mean, stock_images
 
 
 def realisations(stage: Stage, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -35,32 +35,38 @@ def everything(stage: Stage, frame: int) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def sampled(stage: Stage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return realisations(stage, 600)
+def small(stage: Stage) -> Stage:
+    """Posed for POSED_FRAME."""
+    small = Stage(stage.scene, 32, 32)
+    small.pose(POSED_FRAME)
+    return small
 
 
 @pytest.fixture(scope="module")
-def stock(stage: Stage) -> np.ndarray:
+def sampled(small: Stage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return realisations(small, 600)
+
+
+@pytest.fixture(scope="module")
+def stock(small: Stage) -> np.ndarray:
     """All light by the stock integrator, radiance (N, H, W, 3)."""
-    stage.pose(POSED_FRAME)
-    return np.stack([stock_radiance(stage, 3, 16, seed) for seed in range(30)])
+    return stock_images(small, 3, 30)
 
 
-def test_one_spp_images_average_to_the_stock_integrator(stage, sampled, stock):
+def test_one_spp_images_average_to_the_stock_integrator(small, sampled, stock):
     emission, direct, indirect = sampled
-    stage.pose(POSED_FRAME)
-    np.testing.assert_allclose(emission, stock_radiance(stage, 1, 1, 0), atol=1e-6)
-    assert_same_mean(emission + direct, np.stack([stock_radiance(stage, 2, 16, s) for s in range(30)]))
+    np.testing.assert_allclose(emission, stock_images(small, 1, 1, spp=1)[0], atol=1e-6)
+    assert_same_mean(emission + direct, stock_images(small, 2, 30))
     assert_same_mean(emission + direct + indirect, stock)
 
 
-def test_rarely_sampled_lights_have_the_same_mean_and_more_noise(stage, sampled, stock):
+def test_rarely_sampled_lights_have_the_same_mean_and_more_noise(small, sampled, stock):
     emission, *light = sampled
-    stage.lights.sample_rarely(6)
+    small.lights.sample_rarely(6)
     try:
-        _, *rare = realisations(stage, 600)
+        _, *rare = realisations(small, 600)
     finally:
-        stage.lights.sample_rarely(1)
+        small.lights.sample_rarely(1)
     assert_same_mean(emission + sum(rare), stock)
     for often, rarely in zip(light, rare, strict=True):
         assert rarely.var(axis=0).mean() > 2 * often.var(axis=0).mean()
@@ -76,7 +82,7 @@ def test_metal_plastic_and_sky_average_to_the_stock_integrator():
     sky = np.linspace(0.5, 2, 4 * 8 * 3).reshape(4, 8, 3)
     stage = Stage(replace(scene, sky=sky, max_depth=6), 64, 64)
     emission, direct, indirect = realisations(stage, 600)
-    assert_same_mean(emission + direct + indirect, np.stack([stock_radiance(stage, 6, 16, s) for s in range(60)]))
+    assert_same_mean(emission + direct + indirect, stock_images(stage, 6, 60))
 
 
 @pytest.mark.parametrize(
@@ -150,6 +156,7 @@ def test_no_bias_over_many_seeds(stage, rays):
     tracer = PathTracer(stage)
     ours = np.array([np.add(*tracer.radiance(rays, seed, spp=1)).mean() for seed in range(20000)])
     emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"].mean()
-    theirs = np.array([stock_radiance(stage, 3, 64, seed).mean() for seed in range(1024)]) - emission
+    batches = [stock_images(stage, 3, 16, 64, seed) for seed in range(64)]
+    theirs = np.concatenate(batches).mean(axis=(1, 2, 3)) - emission
     error = np.sqrt(ours.var() / len(ours) + theirs.var() / len(theirs))
     assert abs(ours.mean() - theirs.mean()) < 4 * error

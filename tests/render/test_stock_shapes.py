@@ -12,7 +12,7 @@ from render.path import PathTracer
 from render.stage import Stage
 from scenes.animation import Camera, FreeMotion, KeyframedTrack, Scene, StockLight, StockShape, Track
 from scenes.camera import move, pixel_centres, unproject
-from tests.helpers.rendering import assert_same_mean, first_gbuffer, posed_surfaces, rgb, stock_radiance
+from tests.helpers.rendering import assert_same_mean, first_gbuffer, posed_surfaces, rgb, stock_images
 
 SIZE = 24
 WHITE = {"type": "diffuse", "reflectance": rgb(0.8, 0.8, 0.8)}
@@ -98,7 +98,7 @@ def test_radiance_is_that_of_mitsuba_with_all_kinds_of_lights():
     emission = render_gbuffer(stage, stage.view(5))["emission"]
     ray = stage.rays(stage.view(5))
     ours = [np.add(*tracer.radiance(ray, seed, 32)) + emission for seed in range(24)]
-    assert_same_mean(np.array(ours), np.array([stock_radiance(stage, 4, 32, 100 + seed) for seed in range(24)]))
+    assert_same_mean(np.array(ours), stock_images(stage, 4, 24, 32))
 
 
 def test_lights_and_emitters_change_by_their_gain():
@@ -120,35 +120,42 @@ def test_what_cannot_move_or_change_is_refused():
         Stage(Scene((), CAMERA, stock=(StockShape("lamp", KINDS["disk"], WHITE, checks, gain=gain),)), 4, 4)
 
 
-@pytest.mark.parametrize("bsdf_side", [{}, pytest.param({"type": "twosided"}, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", ["normalmap", "bumpmap"])
-@pytest.mark.parametrize("behind", [False, True])
-def test_normals_are_those_that_a_mirror_with_the_same_map_has(kind, bsdf_side, behind):
-    """Half vectors between where light comes from and where the BSDF itself reflects it to."""
+@pytest.mark.parametrize(
+    "twosided, behind", [(False, False), *(pytest.param(True, behind, marks=pytest.mark.slow) for behind in (0, 1))]
+)
+def test_normals_are_those_that_a_mirror_with_the_same_map_has(twosided, behind):
+    """Half vectors between where light comes from and where the BSDF itself reflects it to, of normals and of heights.
+
+    Mirrors have a back only if they are two-sided.
+    """
     rng = np.random.default_rng(3)
-    if kind == "normalmap":
-        tilts = rng.uniform(-0.3, 0.3, (8, 8, 2))
-        normals = np.concatenate([tilts, np.sqrt(1 - (tilts**2).sum(-1, keepdims=True))], axis=-1)
-        texture = {"type": "bitmap", "raw": True, "data": np.float32(normals / 2 + 0.5)}
-        bsdf = {"type": "normalmap", "normalmap": texture, "nested": {"type": "conductor"}}
-    else:
-        texture = {"type": "bitmap", "raw": True, "data": np.float32(rng.uniform(0, 0.4, (8, 8, 1)))}
-        bsdf = {"type": "bumpmap", "texture": texture, "scale": 0.5, "nested": {"type": "conductor"}}
-    if behind and not bsdf_side:
-        pytest.skip("a mirror has no back")
-    bsdf = {**bsdf_side, "bsdf": bsdf} if bsdf_side else bsdf
+    tilts = rng.uniform(-0.3, 0.3, (8, 8, 2))
+    normals = np.concatenate([tilts, np.sqrt(1 - (tilts**2).sum(-1, keepdims=True))], axis=-1)
+    texture = {"type": "bitmap", "raw": True, "data": np.float32(normals / 2 + 0.5)}
+    mapped = {"type": "normalmap", "normalmap": texture, "nested": {"type": "conductor"}}
+    texture = {"type": "bitmap", "raw": True, "data": np.float32(rng.uniform(0, 0.2, (8, 8, 1)))}
+    raised = {"type": "bumpmap", "texture": texture, "scale": 0.5, "nested": {"type": "conductor"}}
     eye = Track.constant([0.2, 0.1, -4.0 if behind else 4.0])
     camera = Camera(eye, Track.constant([0.0, 0, 0]), Track.constant(25.0))
-    stage = Stage(Scene((), camera, stock=(StockShape("square", {"type": "rectangle"}, bsdf),)), 20, 20)
+    squares = tuple(
+        StockShape(
+            name,
+            {"type": "rectangle", "to_world": placed(x, scale=0.5)},
+            {"type": "twosided", "bsdf": bsdf} if twosided else bsdf,
+        )
+        for name, x, bsdf in (("mapped", -0.5, mapped), ("raised", 0.5, raised))
+    )
+    stage = Stage(Scene((), camera, stock=squares), 20, 20)
     view = stage.view(0)
-    normal = render_gbuffer(stage, view)["normal"].reshape(-1, 3)
+    buffer = render_gbuffer(stage, view)
+    normal = buffer["normal"].reshape(-1, 3)
     ray = stage.rays(view)
     si = stage.mitsuba_scene.ray_intersect(ray)
     sample, weight = si.bsdf().sample(mi.BSDFContext(), si, 0.5, mi.Point2f(0.5, 0.5), si.is_valid())
     valid = np.array(si.is_valid() & dr.any(weight > 0))
     half = np.array(si.to_world(sample.wo)) - np.array(ray.d)
     half = (half / np.linalg.norm(half, axis=0)).T
-    assert valid.mean() > 0.5
+    assert all(valid[buffer["mesh_id"].ravel() == number].sum() > 100 for number in (1, 2))
     np.testing.assert_allclose(normal[valid], half[valid], atol=2e-3)
 
 
@@ -173,18 +180,19 @@ def test_directions_of_lights_do_not_depend_on_the_size(light):
     down = mi.ScalarTransform4f().look_at([0, 1, 0], [0, 0, 0.5], [1, 0, 0])
     places = {"to_world": np.array(down.matrix), "direction": [0.0, -1.0, 0.5]}
     sun = StockLight("sun", {"type": "directional", light: places[light], "irradiance": rgb(1, 1, 1)})
-    means = []
+    towards = np.array([0, 1, -0.5]) / np.hypot(1, 0.5)
     for size in (1.0, 1e-3):
         up = np.array(mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(size).matrix)
         floor = StockShape("floor", {"type": "rectangle", "to_world": up}, WHITE)
         eye = Track.constant([0.0, 2 * size, 0.1 * size])
-        stage = Stage(
-            Scene((), Camera(eye, Track.constant([0.0, 0, 0]), Track.constant(20.0)), stock=(floor,), lights=(sun,)),
-            8,
-            8,
-        )
-        means.append(float(np.add(*PathTracer(stage).radiance(stage.rays(stage.view(0)), 1, 16)).mean()))
-    assert means[0] > 0.1 and means[1] == pytest.approx(means[0], rel=1e-3)
+        camera = Camera(eye, Track.constant([0.0, 0, 0]), Track.constant(20.0))
+        stage = Stage(Scene((), camera, stock=(floor,), lights=(sun,)), 8, 8)
+        si = stage.mitsuba_scene.ray_intersect(stage.rays(stage.view(0)))
+        sampled, irradiance = stage.lights.sample_direction(si, mi.Point2f(0.5, 0.5), si.is_valid())
+        lit = si.is_valid() & ~stage.mitsuba_scene.ray_test(si.spawn_ray_to(sampled.p))
+        assert dr.all(lit)
+        np.testing.assert_allclose(stage.image(sampled.d), np.broadcast_to(towards, (8, 8, 3)), atol=1e-5)
+        np.testing.assert_allclose(stage.image(irradiance), 1, rtol=1e-3)
 
 
 @pytest.mark.parametrize("factor", [1e-3, pytest.param(1e4, marks=pytest.mark.slow)])
@@ -208,3 +216,25 @@ def test_the_size_of_a_scene_changes_nothing_but_its_depth(factor):
     same &= plain["mesh_id"][..., 0] > 0
     np.testing.assert_allclose(scaled["depth"][same] / factor, plain["depth"][same], rtol=1e-3)
     assert np.median(np.abs(shown_scaled - shown)[same] / (shown[same] + 0.1)) < 0.02
+
+
+def test_relief_and_hair_of_tiny_scenes_are_those_of_large_ones(tmp_path):
+    """Heights scale with the scene, though Mitsuba measures them apart from it, and so does the thickness of curves."""
+    waves = np.float32(0.5 + 0.4 * np.sin(np.linspace(0, 25, 64)))[None, :, None].repeat(4, axis=0)
+
+    def seen(size: float) -> tuple[float, float]:
+        points = [f"{x * size} {y * size} 0 {0.3 * size}" for x, y in ((-1.5, 0), (-0.5, 0.5), (0.5, 0.5), (1.5, 0))]
+        curve = tmp_path / f"{size}.txt"
+        curve.write_text("\n".join(points))
+        height = {"type": "bitmap", "data": waves, "raw": True}
+        relief = {"type": "bumpmap", "scale": 0.1 * size, "nested": WHITE, "height": height}
+        card = StockShape("card", {"type": "rectangle", "to_world": placed(0, 0, 0, size)}, relief)
+        hair = StockShape("hair", {"type": "bsplinecurve", "filename": str(curve)}, WHITE)
+        camera = Camera(Track.constant([0.0, 0.0, 5 * size]), CAMERA.target, Track.constant(40.0))
+        normals = first_gbuffer(Scene((), camera, stock=(card,), lights=(SKY,)), SIZE, SIZE)["normal"]
+        ids = first_gbuffer(Scene((), camera, stock=(hair,), lights=(SKY,)), SIZE, SIZE)["mesh_id"]
+        return float(normals[..., 0].std()), float((ids > 0).mean())
+
+    tiny, plain = seen(0.01), seen(1.0)
+    assert plain[0] > 0.1 and plain[1] > 0.01
+    assert tiny == pytest.approx(plain, rel=0.02)

@@ -169,6 +169,10 @@ def test_furnished_rooms_hold_pieces_and_are_deterministic(libraries: Path):
     names = [shape.name for shape in one.shapes]
     assert names == [shape.name for shape in again.shapes]
     assert any(name.endswith("-t-1-plain") for name in names)
+
+
+@pytest.mark.slow
+def test_libraries_leave_plain_rooms_as_they_are(libraries: Path):
     own = build_scene("room-1", 0, 2, libraries)
     assert [shape.name for shape in own.shapes] == [shape.name for shape in build_scene("room-1", 0, 2).shapes]
 

@@ -14,7 +14,6 @@ def within(values, low, high):
     return np.isfinite(values).all() and values.min() >= low - 1e-6 and values.max() <= high + 1e-6
 
 
-@settings(max_examples=30)
 @given(seed=SEEDS)
 def test_texture(seed):
     a, b, other = (texture(np.random.default_rng(each)) for each in (seed, seed, seed + 1))
@@ -23,7 +22,6 @@ def test_texture(seed):
     assert np.array_equal(a, b) and not np.array_equal(a, other)
 
 
-@settings(max_examples=30)
 @given(seed=SEEDS, low=st.floats(0, 0.5), span=st.floats(0.01, 0.5))
 def test_gray_texture_spans_its_range(seed, low, span):
     a, b = (gray_texture(np.random.default_rng(seed), low, low + span) for _ in range(2))

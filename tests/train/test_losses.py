@@ -249,7 +249,7 @@ def test_the_background_is_not_learnt_from(batch_of, name):
     assert values[0] == values[1] == values[2] and values[0] > 0
 
 
-@pytest.mark.parametrize("name", TRAINABLE)
+@pytest.mark.parametrize("name", each(TRAINABLE))
 def test_losses_and_gradients_are_finite_at_the_extremes(batch_of, name):
     batch = batch_of(name, crop=16)
     loss = loss_of(name)
@@ -267,7 +267,7 @@ def test_losses_and_gradients_are_finite_at_the_extremes(batch_of, name):
         assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in loss.parameters())
 
 
-@pytest.mark.parametrize("name", TRAINABLE)
+@pytest.mark.parametrize("name", each(TRAINABLE))
 def test_validation_works_in_bfloat16(batch_of, name):
     """Without gradients networks may take other paths, which must work under autocast too."""
     batch = batch_of(name)

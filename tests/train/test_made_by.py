@@ -9,6 +9,7 @@ import torch
 from models.networks.rae import RAE
 from models.registry import create
 from provenance import MadeBy, differences, made_by_here, sources
+from tests.helpers.denoisers import each
 from tests.helpers.training import folder_of, makers_of, short_task
 from train.loop import train_network
 from train.losses.rae import RAELoss
@@ -24,7 +25,7 @@ def code_of(name: str) -> set[str]:
     return set(sources("train.loop", type(recipe_for(name, "tiny").loss).__module__, type(create(name)).__module__))
 
 
-@pytest.mark.parametrize("name", TRAINABLE)
+@pytest.mark.parametrize("name", each(TRAINABLE))
 def test_the_code_that_counts_is_that_of_network_loss_loop_and_data(name):
     """And not that of all networks and recipes, or of evaluation."""
     modules = code_of(name)

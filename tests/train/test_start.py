@@ -16,6 +16,7 @@ from errors import BadInput
 from models.registry import shipped_weights
 from models.spec import load
 from provenance import file_digest
+from tests.helpers.denoisers import each
 from tests.helpers.frames import run
 from tests.helpers.training import SHORT, folder_of, fresh_weights, metadata, short_task, tensors
 from tests.test_cli import fails
@@ -58,12 +59,10 @@ def test_it_begins_with_the_general_network_bit_for_bit(tiny, tmp_path, general)
         assert begun.keys() == wanted.keys() and all(torch.equal(begun[key], wanted[key]) for key in wanted)
 
 
-# The others take longer.
-QUICK = ("wskp3", "nbgd")
-EVERY_NETWORK = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in TRAINABLE]
+OFTEN = "nbgd"  # the others take longer
 
 
-@pytest.mark.parametrize("name", EVERY_NETWORK)
+@pytest.mark.parametrize("name", each(TRAINABLE, *(name for name in TRAINABLE if name != OFTEN)))
 def test_no_network_ends_worse_than_it_began(tiny, tmp_path, name):
     """By the validation loss, at a rate a thousand times too high; the weights kept are those of that loss."""
     task = replace(task_for(name, tiny, tmp_path, "tiny"), precision="float32")

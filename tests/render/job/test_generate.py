@@ -153,14 +153,19 @@ def test_two_processes_on_one_folder_share_the_work(tiny, tiny_copy):
     assert digest(tiny_copy) == digest(tiny)
 
 
-@pytest.mark.parametrize("count", [4, 8])
-def test_shares_are_disjoint_and_their_union_is_the_whole(count, tiny, tmp_path, monkeypatch):
-    """Here clips are not rendered: those of the fixture take their place, in the same folder."""
+@pytest.fixture
+def copied(tiny, monkeypatch):
+    """Clips are not rendered: those of the dataset `tiny` take their place, in the same folder."""
 
-    def copied(folder: Path, *_: object) -> None:
+    def copy(folder: Path, *_: object) -> None:
         shutil.copytree(tiny.joinpath(*folder.parts[-3:]), folder)
 
-    monkeypatch.setattr(render.job.generate, "render_to_folder", copied)
+    monkeypatch.setattr(render.job.generate, "render_to_folder", copy)
+
+
+@pytest.mark.usefixtures("copied")
+@pytest.mark.parametrize("count", [4, 8])
+def test_shares_are_disjoint_and_their_union_is_the_whole(count, tiny, tmp_path):
     roots = [tmp_path / str(index) for index in range(1, count + 1)]
     counts = [generate_tiny(root, part=f"{index}/{count}") for index, root in enumerate(roots, 1)]
     assert sum(counts) == 6 and max(counts) - min(counts) <= 1
@@ -194,18 +199,18 @@ def test_a_clip_that_fails_does_not_stop_the_others(tiny_copy, monkeypatch):
 
 
 def test_non_finite_samples_are_counted_and_reported(tiny_copy, monkeypatch):
-    remove_clips(tiny_copy, "val/cornell_box/000", "val/cornell_box_moving/000")
+    remove_clips(tiny_copy, "val/cornell_box/000")
     genuine = render.clip.render_clip
 
     def faulty(scene, *arguments):
         for index, (channels, seconds) in enumerate(genuine(scene, *arguments)):
-            if index == 3 and not scene.moves():
+            if index == 3:
                 channels["direct"][0, 5, 5:7] = np.nan
                 channels["indirect_reference"][1, 0, 0, 2] = np.inf
             yield channels, seconds
 
     monkeypatch.setattr(render.clip, "render_clip", faulty)
-    assert generate_tiny(tiny_copy) == 2
+    assert generate_tiny(tiny_copy) == 1
     box, moving = Dataset(tiny_copy).clips("val")
     assert {name: n for name, n in box.facts["nonfinite"].items() if n} == {"direct": 6, "indirect_reference": 1}
     assert not any(moving.facts["nonfinite"].values())
@@ -217,13 +222,15 @@ def test_non_finite_samples_are_counted_and_reported(tiny_copy, monkeypatch):
     assert bad.pop("val/cornell_box/000") == "7" and set(bad.values()) == {"0"}
 
 
-def test_incomplete_files_are_replaced(tiny, tmp_path):
+@pytest.mark.usefixtures("copied")
+def test_incomplete_files_are_replaced(tiny, tmp_path, monkeypatch):
     root = tmp_path / "data"
     root.mkdir()
     (root / ".dataset.json.tmp").write_text("{")  # killed before the first file was in place
     assert generate_tiny(root, part="1/6") == 1
     [clip] = root.glob("*/*/*")
     (clip / "clip.json").unlink()
+    monkeypatch.undo()
     assert generate_tiny(root, part="1/6") == 1
     assert is_clip(clip) and (root / "dataset.json").exists() and digest(root).items() < digest(tiny).items()
 

@@ -70,8 +70,8 @@ CASES = {
 
 # Each of their scenes takes kernels of its own.
 OF_OWN_KERNELS = (
-    "a moving sun", "lost sky", "roughcoating", "sensor on a shape", "shining group", "spot without picture",
-    "unknown property", "wrong parts",
+    "a moving sun", "a property called type", "lost sky", "no light", "no place", "roughcoating", "sensor on a shape",
+    "shining group", "sky on a shape", "spot without picture", "unknown property", "wrong parts",
 )  # fmt: skip
 
 
@@ -93,7 +93,8 @@ def test_it_is_rendered(tmp_path, case):
     assert np.isfinite(image).all() and image.max() > 0
 
 
-def test_files_of_pictures(tmp_path):
+@pytest.fixture
+def pictures(tmp_path):
     """A texture, a bump map, a shining picture and a sky, each of a file."""
     values = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
     mi.Bitmap(values).write(str(tmp_path / "sky.exr"))
@@ -105,10 +106,17 @@ def test_files_of_pictures(tmp_path):
         f'<shape type="cube"><emitter type="area">{picture.format("radiance")}</emitter></shape>',
     )
     ball = painted(bsdf("diffuse", picture.format("reflectance")))
-    scene = own(tmp_path, xml(*parts, light=named("emitter", "envmap", "sky.exr"), shape=ball))
-    assert scene.notes == [] and len(scene.scene.stock) == 4
-    assert scene.scene.stock[1].bsdf["type"] == "bumpmap"
-    assert np.isfinite(rendered(scene)).all()
+    return own(tmp_path, xml(*parts, light=named("emitter", "envmap", "sky.exr"), shape=ball))
+
+
+def test_files_of_pictures(pictures):
+    assert pictures.notes == [] and len(pictures.scene.stock) == 4
+    assert pictures.scene.stock[1].bsdf["type"] == "bumpmap"
+
+
+@pytest.mark.slow
+def test_files_of_pictures_are_rendered(pictures):
+    assert np.isfinite(rendered(pictures)).all()
 
 
 def test_a_plain_scene_needs_no_words(tmp_path):
