@@ -156,7 +156,6 @@ def test_no_bias_over_many_seeds(stage, rays):
     tracer = PathTracer(stage)
     ours = np.array([np.add(*tracer.radiance(rays, seed, spp=1)).mean() for seed in range(20000)])
     emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"].mean()
-    batches = [stock_images(stage, 3, 16, 64, seed) for seed in range(64)]
-    theirs = np.concatenate(batches).mean(axis=(1, 2, 3)) - emission
+    theirs = np.array([stock_images(stage, 3, 1, 64, seed).mean() for seed in range(1024)]) - emission
     error = np.sqrt(ours.var() / len(ours) + theirs.var() / len(theirs))
     assert abs(ours.mean() - theirs.mean()) < 4 * error
