@@ -33,9 +33,7 @@ from models.denoiser import LayeredState, State
 from models.filters.neighbours import mesh_sums, mesh_sums_9x9
 from models.operators import MIN_DIVISOR, image_luminance
 from models.wrappers import shrinkage
-from models.wrappers.adaptive import AccumulatedAfterState
 from models.wrappers.shrinkage import JamesStein
-from models.wrappers.taa import TAAState
 
 MAX_SAMPLES = 2.0**20  # per pixel; no larger number is recommended
 
@@ -160,9 +158,8 @@ def of_one_layer(state: State) -> State:
     """A state, of wrappers too, with the history of the main layer of glass in place of that of both."""
     if isinstance(state, LayeredState):
         return state.main
-    if isinstance(state, TAAState | AccumulatedAfterState):
-        return replace(state, inner=of_one_layer(state.inner))
-    return state
+    inner: State | None = getattr(state, "inner", None)  # of a wrapper
+    return replace(state, inner=of_one_layer(inner)) if inner else state  # type: ignore[call-arg]
 
 
 def estimate_error(
