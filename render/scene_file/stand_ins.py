@@ -221,7 +221,7 @@ FILTERS = ("bilinear", "nearest")
 def valid_microfacets(described: Properties) -> StandIn | None:
     """Before version 3 there were the distributions "phong" and "as", with the width of Beckmann's for an alpha.
 
-    Plastic could be rougher here than there.
+    The roughness of plastic could be a texture.
     """
     distribution = described.get("distribution", "beckmann")
     changes: Properties = {}
