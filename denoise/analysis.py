@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d
 
-from datasets.channels import CHANNELS
 from datasets.frame import to_image
 from datasets.tonemap import luminance
 from denoise.foreign_frame import ForeignFrame, Image, read_foreign_frame
-from denoise.frames import InputConventions, are_encoded, camera_conventions
+from denoise.frames import InputConventions, are_encoded, camera_conventions, check_reads
 from denoise.layers import COLOUR, QUANTITIES, normalised
 from denoise.motion_convention import ConventionDetector, MotionConvention
 from denoise.sequence import FrameFiles
@@ -43,8 +42,7 @@ def analyse(
     `given` is the convention of motion vectors, and `albedo` "exact" or "sampled", if the user names them. Raises
     BadInput for a channel that only onespp renders.
     """
-    if ours := [channel for channel in reads if CHANNELS[channel].renderer_only]:
-        raise BadInput(f"the denoiser reads {', '.join(ours)}, which only onespp renders: use another, such as svgf")
+    check_reads("the denoiser", reads)
     first, _ = read_foreign_frame(shots[0][0], sources)
     conventions = camera_conventions(first)
     report = [(quantity, str(sources.quantities[quantity])) for quantity in QUANTITIES if sources.has(quantity)]

@@ -6,10 +6,9 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import CHANNELS
 from datasets.frame import Frame
 from denoise.foreign_frame import ForeignFrame, make_finite, surface_of
-from denoise.frames import FrameBuilder, InputConventions
+from denoise.frames import FrameBuilder, InputConventions, check_reads
 from denoise.layers import COLOUR, QUANTITIES
 from denoise.motion_convention import MotionConvention
 from errors import BadInput
@@ -29,8 +28,7 @@ def check_usable(denoiser: Denoiser) -> None:
     if denoiser.signal == "indirect":
         remedy = 'load it by onespp.load(..., signal="total")'
         raise BadInput(f"{name} denoises indirect light, and arrays have only the total: {remedy}")
-    if ours := [channel for channel in denoiser.reads if CHANNELS[channel].renderer_only]:
-        raise BadInput(f"{name} reads {', '.join(ours)}, which only onespp renders: use another, such as svgf")
+    check_reads(name, denoiser.reads)
 
 
 def frames_of_arrays(sequence: Iterable[Quantities], denoiser: Denoiser, spp: float) -> Iterator[Frame]:

@@ -35,11 +35,11 @@ def compare(
     """
     rows = []
     for files, reference in zip(frames, references, strict=True):
-        reference_pair = to_tensor(radiance(reference, target)).repeat(2, 1, 1, 1)  # of one: its noise is unknown
+        reference_pair = to_tensor(radiance(reference, target)).repeat(2, 1, 1, 1)
         denoised = to_tensor(radiance(out / files.name, target))
         if reference_pair.shape[1:] != denoised.shape[1:]:
             raise BadInput(f"{reference} is of another size than {out / files.name}")
-        comparison = Comparison(denoised, reference_pair, exposure)
+        comparison = Comparison(denoised, reference_pair, exposure, one_reference=True)
         rows.append([files.number, *(METRICS[name].of(comparison) for name in COMPARED_METRICS)])
     write_csv(out / METRICS_FILE, ["frame", *COMPARED_METRICS], rows)
     columns = zip(COMPARED_METRICS, list(zip(*rows, strict=True))[1:], strict=True)

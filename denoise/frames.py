@@ -42,6 +42,12 @@ class InputConventions:
         return self.motion is not None or self.cameras is not None
 
 
+def check_reads(name: str, reads: Sequence[str]) -> None:
+    """Raise BadInput, naming the denoiser, where it `reads` channels that no other renderer has."""
+    if ours := [channel for channel in reads if CHANNELS[channel].renderer_only]:
+        raise BadInput(f"{name} reads {', '.join(ours)}, which only onespp renders: use another, such as svgf")
+
+
 def are_encoded(normals: Image, surface: NDArray[np.bool_]) -> bool:
     """Whether normals (H, W, 3) are scaled to [0, 1], as for 8-bit images."""
     shown = normals[surface & (normals != 0).any(axis=-1)]
