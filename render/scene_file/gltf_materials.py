@@ -61,6 +61,8 @@ def surface_mean(mesh: trimesh.Trimesh, uv: Array, values: Array) -> Array:
     """The mean (C,) over a mesh's surface of a repeated image (H, W, C) whose first row is at v = 1."""
     rng = np.random.default_rng(0)
     areas = mesh.area_faces
+    if not areas.any():  # nor does it emit anything
+        return np.asarray(values.mean(axis=(0, 1)))
     faces = rng.choice(len(areas), SURFACE_SAMPLES, p=areas / areas.sum())
     corners = uv[mesh.faces[faces]]
     places = (rng.dirichlet(np.ones(3), SURFACE_SAMPLES)[..., None] * corners).sum(axis=1) % 1  # uniform on triangles

@@ -9,11 +9,13 @@ import sys
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from errors import BadInput
 from render.path import PosedFrame
 from render.scene_file.assets import linear_image, unit_values
+from render.scene_file.gltf_materials import surface_mean
 from render.scene_file.mesh_file import MeshFile
 from render.stage import Stage
 from scenes.animation import Camera, Scene
@@ -97,6 +99,12 @@ def test_names_of_several_primitives_are_the_same_in_every_process(tmp_path):
     assert len(results) == 1
     wanted = ["car_paint", "car_material 1", "car_material 1-2", "mesh_paint", "mesh_material 1", "mesh_material 1-2"]
     assert results.pop().startswith(str(wanted))
+
+
+def test_a_mesh_without_area_has_the_mean_of_its_texture():
+    point = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False)
+    image = np.array([[[0.0, 1.0, 0.5], [1.0, 1.0, 0.0]]])
+    np.testing.assert_allclose(surface_mean(point, np.zeros((3, 2)), image), [0.5, 1, 0.25])
 
 
 def test_emissive_textures_emit_their_mean_over_the_mesh(tmp_path):
