@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
-from render.first_bounce import first_bounce
+from render.first_bounce import first_bounce, of_sample
 from render.gbuffer import Arrays, VisibleSurface, trace_visible
 from render.materials import registry_index
 from render.path import PathTracer, SampleRange
@@ -70,6 +70,26 @@ class MeshPoint(NamedTuple):
         return np.concatenate([[False], moved])[self.mesh_id]
 
 
+def tracked_hits(stage: Stage, *sample: Any) -> list[Any]:
+    """What `hits_of_samples` returns, as Dr.Jit's arrays."""
+    scene = stage.mitsuba_scene
+    si, light, _, infinite, faces, bsdf_sample = first_bounce(stage, *sample)
+    blocker = scene.ray_intersect(si.spawn_ray_to(light.p), mi.RayFlags.Minimal, coherent=False, active=faces)
+    glossy = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.GlossyReflection)
+    reflects = (bsdf_sample.pdf > 0) & (glossy | mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.DeltaReflection))
+    onward = si.spawn_ray(si.to_world(bsdf_sample.wo))
+    reflected = scene.ray_intersect(onward, mi.RayFlags.Minimal, coherent=False, active=reflects)
+    shape = registry_index(light.emitter.get_shape())
+    light_id = dr.gather(mi.UInt32, stage.mesh_id_of_shape, shape, faces & ~infinite)
+    hit = reflected.is_valid()
+    return [
+        *(blocker.p, stage.mesh_id(blocker), blocker.is_valid()),
+        *(dr.select(infinite, light.d, light.p), light_id, ~infinite),
+        *(dr.select(hit, reflected.p, onward.d), stage.mesh_id(reflected), hit, reflects),
+        si.n,
+    ]
+
+
 def hits_of_samples(
     tracer: PathTracer, view: View, draw: SampleRange
 ) -> tuple[MeshPoint, MeshPoint, MeshPoint, NDArray[np.bool_], Array]:
@@ -79,23 +99,7 @@ def hits_of_samples(
     (H, W); the geometric normal of the surface itself (H, W, 3)).
     """
     stage = tracer.stage
-    scene = stage.mitsuba_scene
-    si, light, _, infinite, faces, sample = first_bounce(tracer, view, draw.seed, draw.first)
-    blocker = scene.ray_intersect(si.spawn_ray_to(light.p), mi.RayFlags.Minimal, coherent=False, active=faces)
-    glossy = mi.has_flag(sample.sampled_type, mi.BSDFFlags.GlossyReflection)
-    reflects = (sample.pdf > 0) & (glossy | mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection))
-    onward = si.spawn_ray(si.to_world(sample.wo))
-    reflected = scene.ray_intersect(onward, mi.RayFlags.Minimal, coherent=False, active=reflects)
-    shape = registry_index(light.emitter.get_shape())
-    light_id = dr.gather(mi.UInt32, stage.mesh_id_of_shape, shape, faces & ~infinite)
-    hit = reflected.is_valid()
-    values: list[Any] = [
-        *(blocker.p, stage.mesh_id(blocker), blocker.is_valid()),
-        *(dr.select(infinite, light.d, light.p), light_id, ~infinite),
-        *(dr.select(hit, reflected.p, onward.d), stage.mesh_id(reflected), hit, reflects),
-        si.n,
-    ]
-    dr.eval(values)
+    values = of_sample(tracked_hits, tracer, view, draw.seed, draw.first)
     arrays = [stage.image(value) for value in values]
 
     def mesh_point(point: NDArray[Any], mesh_id: NDArray[Any], finite: NDArray[Any]) -> MeshPoint:

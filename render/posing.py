@@ -98,5 +98,5 @@ def as_parameter(value: NDArray[np.float32], parameter: Any) -> Any:
         dr.make_opaque(matrix)
         return matrix
     if value.shape in ((3,), (3, 1)) and isinstance(parameter, mi.Color3f):
-        return mi.Color3f(*map(mi.Float, value.reshape(3, 1)))
+        return mi.Color3f(*map(upload, value.reshape(3, 1)))
     return upload(value.ravel())

@@ -49,7 +49,7 @@ class BlurredTable:
     def __init__(self, stage: Stage):
         self.row = registry_table(mi.UInt32, {index: row for row, index in enumerate(stage.bsdfs)})
         described = stage.bsdf_descriptions
-        loader = StockLoader()
+        loader = StockLoader(stage.unit)
         # Keeps objects alive, which pointers do not.
         self.bsdfs = [
             loader.load(blurred(described[index])) if index in described else own for index, own in stage.bsdfs.items()

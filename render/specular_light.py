@@ -12,11 +12,14 @@ from render.loading import columns, upload
 from render.materials import is_in
 from render.stage import Stage
 
+MIN_BATCH = 4096  # rays traced together, since Dr.Jit 1.5 records anew for most smaller numbers
+
 
 def branches_at_end(stage: Stage, *rays: mi.Float) -> tuple[mi.Color3f, list[tuple[mi.Bool, list[mi.Float]]]]:
     """(radiance from where `rays` end, for each delta lobe where it continues them; origin, direction, throughput)."""
     origin, direction, throughput = mi.Point3f(rays[:3]), mi.Vector3f(rays[3:6]), mi.Color3f(rays[6:])
-    si = stage.mitsuba_scene.ray_intersect(mi.Ray3f(origin, direction), mi.RayFlags.All, coherent=False)
+    exists = dr.any(throughput > 0)
+    si = stage.mitsuba_scene.ray_intersect(mi.Ray3f(origin, direction), mi.RayFlags.All, coherent=False, active=exists)
     active = si.is_valid()
     active &= is_in(stage.specular, si.bsdf(), active)
     branches = []
@@ -45,10 +48,12 @@ def specular_light(
     total = np.zeros((count, 3))
     for _ in range(max_events + 1):
         if len(pixel):
-            radiance, branches = stage.replay(branches_at_end, *map(upload, rays.T))
-            np.add.at(total, pixel, columns(radiance))  # in the order of chains; Dr.Jit would add in any order
+            none = np.zeros((max(0, MIN_BATCH - len(rays)), 9))
+            radiance, branches = stage.replay(branches_at_end, *map(upload, np.concatenate([rays, none]).T))
+            # In the order of chains; Dr.Jit would add in any order.
+            np.add.at(total, pixel, columns(radiance)[: len(rays)])
             # Chains branch: a pixel that shows glass has several, and many have none.
-            longer = [(np.array(follows), columns(onward)) for follows, onward in branches]
+            longer = [(np.array(follows)[: len(rays)], columns(onward)[: len(rays)]) for follows, onward in branches]
             rays = np.concatenate([rays[:0], *(onward[follows] for follows, onward in longer)])
             pixel = np.concatenate([pixel[:0], *(pixel[follows] for follows, _ in longer)])
     return total.astype(np.float32)

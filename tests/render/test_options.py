@@ -157,6 +157,18 @@ def test_instances_of_diffuse_balls_keep_their_light(bsdf):
     assert all(np.array_equal(a, b) for a, b in zip(plain, regular, strict=True))
 
 
+def test_relief_of_tiny_scenes_is_that_of_their_own_materials():
+    relief = {"type": "bitmap", "raw": True, "data": np.random.default_rng(0).random((4, 4, 1), np.float32)}
+    material = {"type": "bumpmap", "texture": relief, "scale": 1e-3, "bsdf": {"type": "roughplastic", "alpha": 0.1}}
+    ball = StockShape("ball", {"type": "sphere", "radius": 1e-3, "to_world": np.eye(4)}, material)
+    stage = Stage(replace(build_scene("cornell_box", 0, 1), shapes=(), stock=(ball,)), 8, 8)
+    own, table = (
+        [mi.traverse(bsdf)["scale"] for bsdf in each if bsdf.class_name() == "BumpMap"]
+        for each in (stage.bsdfs.values(), BlurredTable(stage).bsdfs)
+    )
+    assert stage.unit < 0.1 and own == table
+
+
 def test_materials_of_instances_are_blurred():
     table = BlurredTable(stage_with_instance({"type": "conductor"}))
     assert [bsdf.class_name() for bsdf in table.bsdfs].count("RoughConductor") == 1

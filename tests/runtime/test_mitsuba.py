@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from datasets.channels import MIRRORED
+from render import look_through, materials, stage
 from render.backend import mi
 from render.gbuffer import render_gbuffer
 from render.stage import Stage
+from scenes import camera
 from scenes.camera import axis_rotation, pixel_centres
 from scenes.registry import build_scene
 from tests.helpers.c_runtime import FOLDER
@@ -45,6 +47,16 @@ def package(unpacked):
     sys.path[:0] = added
     yield importlib.import_module("onespp_mitsuba")
     sys.path[:] = [path for path in sys.path if path not in added]
+
+
+def test_limits_are_those_of_our_renderer(package):
+    """The package stands alone, so its constants are copies."""
+    ours = {name: value for module in (look_through, materials, stage, camera) for name, value in vars(module).items()}
+    modules = [importlib.import_module(f"onespp_mitsuba.{name}") for name in ("sight", "bsdfs", "camera")]
+    copies = {name: value for module in modules for name, value in vars(module).items() if name.isupper()}
+    shared = copies.keys() & ours.keys()
+    assert len(shared) >= 9
+    assert {name: copies[name] for name in shared} == {name: ours[name] for name in shared}
 
 
 def sensor_at(camera_to_world: np.ndarray, x_fov: float = 60.0, size: tuple[int, int] = (HEIGHT, WIDTH)):
