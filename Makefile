@@ -1,6 +1,7 @@
 # One call of `onespp` a target. Everything below `setup` runs in the virtual environment it makes.
 PROFILE ?= quick
-BUDGET ?= $(PROFILE)
+# That of the profile's name, if there is one.
+BUDGET ?= $(or $(filter tiny quick release furnished,$(PROFILE)),quick)
 DATA ?= data/$(PROFILE)
 RUNS ?= runs
 PYTHON ?= python3
@@ -18,6 +19,9 @@ START := $(shell date +%s)
 SECONDS = $$(( $$(date +%s) - $(START) ))
 # Whether this call does everything but set-up: what a later one takes says nothing.
 FRESH := $(shell [ $(READY) -nt pyproject.toml ] && [ ! -e $(DATA) ] && [ ! -e $(RUNS) ] && echo yes)
+# Whether tests are run for the first time after a `make` that kept its time.
+FIRST_TEST := $(shell [ $(READY) -nt pyproject.toml ] && [ -e $(RUNS)/make.seconds ] && \
+	[ ! -e $(RUNS)/test.seconds ] && echo yes)
 
 all: dataset train eval report
 	@$(if $(FRESH),echo $(SECONDS) > $(RUNS)/make.seconds,:)
@@ -60,7 +64,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 test: $(READY)
 	$(PYTEST)
-	@mkdir -p $(RUNS) && echo $(SECONDS) > $(RUNS)/test.seconds
+	@$(if $(FIRST_TEST),echo $(SECONDS) > $(RUNS)/test.seconds,:)
 
 # Blender as a Python module, with which test-all renders. It needs Python 3.11 and another numpy, so an environment of
 # its own. `make test-all BLENDER=` goes without.

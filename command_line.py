@@ -18,7 +18,7 @@ from errors import BadInput
 from process import set_up_process
 
 Data = Annotated[Path | None, arg(metavar="DIR", help="the dataset; by default data/PROFILE")]
-RenderedData = Annotated[Path, arg(help="the dataset")]
+RenderedData = Annotated[Path, arg(metavar="DIR", help="the dataset")]
 DataOfBudget = Annotated[Path | None, arg(metavar="DIR", help="the dataset; by default data/BUDGET")]
 Device = Annotated[Literal["cpu", "cuda"], arg(help="where to compute")]
 Runs = Annotated[Path, arg(metavar="DIR", help="folder of trainings and results")]
@@ -26,8 +26,8 @@ Profile = Annotated[
     str,
     arg(
         metavar="{tiny,quick,release,release-256,furnished,furnished-192,benchmark,glass,rooms-NxS}",
-        help="which clips, and how well sampled: seconds, minutes, the release (days), larger, for --models, larger "
-        "with rarer light, long clips, glass, or N small rooms with references of S spp",
+        help="which clips (docs/data.md): tiny takes seconds, quick minutes, release days; furnished needs --models; "
+        "rooms-NxS: N small rooms, with references of S spp",
     ),
 ]
 Budget = Annotated[
@@ -37,9 +37,9 @@ Budget = Annotated[
         help="how long networks are trained; the weights are in RUNS/train/NAME-BUDGET",
     ),
 ]
-Denoisers = Annotated[tuple[str, ...], Positional, arg(metavar="DENOISER...", help="by default those listed above")]
+Denoisers = Annotated[tuple[str, ...], Positional, arg(metavar="[DENOISER...]", help="their names (docs/denoisers.md)")]
 Scenes = Annotated[
-    tuple[str, ...], Positional, arg(metavar="SCENE...", help="such as cornell_box, room-3 or my-scene.toml")
+    tuple[str, ...], Positional, arg(metavar="[SCENE...]", help="such as cornell_box, room-3 or my-scene.toml")
 ]
 Size = Annotated[str, arg(metavar="WxH", help="size of the images")]
 Threads = Annotated[int | None, arg(metavar="N", help="by default as many as PyTorch uses")]
@@ -48,6 +48,7 @@ Models = Annotated[
     Path | None,
     arg(metavar="DIR", help="furnish rooms (of datasets, those to train on) from its *.sh3f (docs/data.md)"),
 ]
+Seed = Annotated[int, arg(help="of scenes, flights and noise")]
 Png = Annotated[Path, arg(metavar="PNG", help="the image to write")]
 RUNS = Path("runs")
 DEFAULT_SPP = (1, 2, 4, 8, 16, 32, 64, 128, 256)
@@ -58,7 +59,11 @@ def data_folder(data: Path | None, name: str) -> Path:
 
 
 def preview(
-    names: Scenes = (), out: Png = RUNS / "preview.png", seed: int = 0, spp: int = 64, models: Models = None
+    names: Scenes = (),
+    out: Png = RUNS / "preview.png",
+    seed: Seed = 0,
+    spp: Annotated[int, arg(help="samples per pixel")] = 64,
+    models: Models = None,
 ) -> None:
     """Draw a contact sheet of scenes, by default of 16 rooms: the middle frame of each."""
     from eval.figures.contact_sheet import contact_sheet
@@ -73,7 +78,7 @@ def dataset(
     data: Data = None,
     profile: Profile = "quick",
     scene: Annotated[Path | None, arg(metavar="TOML")] = None,
-    seed: int = 0,
+    seed: Seed = 0,
     reads: Annotated[tuple[str, ...], arg(metavar="DENOISER...")] = (),
     part: Annotated[str, arg(metavar="K/N")] = "1/1",
     models: Models = None,
@@ -107,16 +112,16 @@ def train(
     data: DataOfBudget = None,
     runs: Runs = RUNS,
     budget: Budget = "quick",
-    seed: int = 0,
-    precision: Literal["float32", "bfloat16"] | None = None,
+    seed: Annotated[int, arg(help="of first weights and of the order of the data")] = 0,
+    precision: Annotated[Literal["float32", "bfloat16"] | None, arg(metavar="{float32,bfloat16}")] = None,
     micro_batch: Annotated[int | None, arg(metavar="N")] = None,
     from_: Annotated[str | None, arg(name="from", metavar="weights|FILE")] = None,
     specialise: Flag = False,
 ) -> None:
     """Train networks, or resume: by default wskp6 for quick, one for furnished, else rae, wskp6 and ntd-mean.
 
-    On several GPUs or machines: `torchrun --nproc-per-node N -m onespp train ...`. Every batch is shared by all
-    processes, so the steps are the same.
+    On several GPUs or machines with a common RUNS: `torchrun --nproc-per-node N -m onespp train ...`. Every batch is
+    shared by all processes, so the steps are the same.
 
     Args:
         precision: by default the fastest on this machine.
@@ -226,7 +231,7 @@ def exr(
 def show(
     clip: Annotated[Path, Positional, arg(metavar="CLIP", help="the clip's folder")],
     names: Denoisers = (),
-    out: Annotated[Path, arg(metavar="DIR")] = RUNS / "show",
+    out: Annotated[Path, arg(metavar="DIR", help="where to write the pictures")] = RUNS / "show",
     runs: Runs = RUNS,
     budget: Budget = "quick",
 ) -> None:
@@ -243,7 +248,7 @@ def export(
     name: Annotated[
         str, Positional, arg(metavar="DENOISER", help="wskp3, wskp6 or one; NAME@BUDGET for weights in RUNS")
     ],
-    to: Literal["onnx", "pt2"] = "onnx",
+    to: Annotated[Literal["onnx", "pt2"], arg(help="ONNX, or a file for torch.export.load")] = "onnx",
     out: Annotated[Path | None, arg(metavar="DIR", help="by default RUNS/export/DENOISER-TO")] = None,
     runs: Runs = RUNS,
     weights: Annotated[Path | None, arg(metavar="FILE", help="by default the shipped ones")] = None,
@@ -277,7 +282,7 @@ def bench_denoisers(
 
 
 def bench_light(names: Denoisers = (), runs: Runs = RUNS, budget: Budget = "quick") -> None:
-    """Measure how many frames the output lags after a light changes.
+    """Measure how many frames the output lags after a light changes, by default of all denoisers that can run.
 
     Renders four clips of the Cornell box in a few minutes; table, plot and results.json in RUNS/bench/light.
     """
@@ -290,7 +295,7 @@ def stress(
     names: Denoisers = (),
     runs: Runs = RUNS,
     budget: Budget = "quick",
-    long: Annotated[bool, FlagCreatePairsOff, arg(help="also run sequences of 10 000 frames (minutes)")] = False,
+    long: Annotated[Flag, arg(help="also run sequences of 10 000 frames (minutes)")] = False,
     precision: Annotated[Literal["float32", "bfloat16", "float16"], arg(help="of networks")] = "float32",
 ) -> None:
     """Run denoisers on extreme input, by default all that can run: tables, results.json, a heat map.
@@ -309,8 +314,8 @@ def trade(
     data: DataOfBudget = None,
     runs: Runs = RUNS,
     budget: Budget = "quick",
-    size: Annotated[str | None, arg(metavar="WxH", help="of the images that were timed; by default the clips'")] = None,
-    threads: Annotated[int | None, arg(metavar="N", help="that were timed; by default the most")] = None,
+    size: Annotated[str | None, arg(metavar="WxH", help="use times at this size; by default the clips'")] = None,
+    threads: Annotated[int | None, arg(metavar="N", help="use times with so many; by default the most")] = None,
     spp: Annotated[tuple[int, ...], arg(metavar="N...", help="samples per pixel, rising")] = DEFAULT_SPP,
 ) -> None:
     """Compare quality with milliseconds, by denoiser, precision and samples per pixel: tables, a plot, trade.json.
@@ -341,7 +346,7 @@ def denoise(job: Annotated[Job, arg(name="")], runs: Runs = RUNS, threads: Threa
 def relight(
     frames: Annotated[tuple[str, ...], Positional, arg(metavar="PATTERN...")],
     lights: Annotated[tuple[str, ...], arg(metavar="LAYER...")],
-    out: Annotated[Path, arg(metavar="PAGE")] = Path("relight.html"),
+    out: Annotated[Path, arg(metavar="PAGE", help="the page to write")] = Path("relight.html"),
     frame_range: Annotated[str | None, arg(name="frames", metavar="A-B")] = None,
 ) -> None:
     """Write a page that dims and tints the denoised lights of a sequence: one file that works offline.
@@ -358,7 +363,7 @@ def relight(
 
 
 def weights(
-    name: Annotated[str | None, Positional, arg(metavar="NETWORK", help="show the card of this network")] = None,
+    name: Annotated[str | None, Positional, arg(metavar="[NETWORK]", help="show the card of this network")] = None,
     card: Annotated[Path | None, arg(metavar="RUNS")] = None,
     average: Annotated[tuple[Path, ...], arg(metavar="FILE...", help="weights of NETWORK to average")] = (),
     out: Annotated[Path | None, arg(metavar="FILE", help="where to write their mean")] = None,
@@ -390,14 +395,17 @@ def import_(
     files: Annotated[Literal["bmfr", "noisebase"], Positional, arg(help="whose files")],
     source: Annotated[Path, Positional, arg(metavar="DIR", help="their folder")],
     data: Annotated[Path | None, arg(metavar="DIR", help="the dataset; by default data/bmfr and so on")] = None,
-    spp: Annotated[int, arg(help="samples per pixel to use of Noisebase's")] = 2,
+    spp: Annotated[int | None, arg(help="samples per pixel to use of Noisebase's; by default 2")] = None,
 ) -> None:
     """Make a dataset of the frames of BMFR (Koskela et al. 2019) or of Noisebase (Balint et al. 2023)."""
     from datasets.bmfr_files import import_bmfr
     from datasets.noisebase_files import import_noisebase
 
+    if files == "bmfr" and spp is not None:
+        raise BadInput("--spp is an option of noisebase: BMFR's frames are of 1 spp")
     folder = data_folder(data, files)
-    clips = import_bmfr(source, folder) if files == "bmfr" else import_noisebase(source, folder, spp)
+    samples = 2 if spp is None else spp
+    clips = import_bmfr(source, folder) if files == "bmfr" else import_noisebase(source, folder, samples)
     print(f"{folder}: {clips} clips")
 
 
@@ -416,14 +424,14 @@ def benchmark_list(
 
 
 def benchmark_run(
-    names: Annotated[tuple[str, ...], Positional, arg(metavar="DENOISER...", help="by default OIDN, svgf, one")] = (),
+    names: Annotated[tuple[str, ...], Positional, arg(metavar="[DENOISER...]", help="by default OIDN, svgf, one")] = (),
     scenes: Annotated[Path | None, arg(metavar="DIR", help="the folder that has a folder for each scene")] = None,
     data: Annotated[Path, arg(metavar="DIR", help="where datasets are rendered")] = Path("data/benchmark"),
     runs: Runs = RUNS / "benchmark",
     size: Size = "640x360",
     frames: Annotated[int, arg(metavar="N", help="of each clip")] = 49,
     floor: Annotated[float, arg(metavar="DB", help="noise floor of the references")] = 35.0,
-    own: Annotated[bool, FlagCreatePairsOff, arg(help="also five scenes of ours that no training uses")] = False,
+    own: Annotated[Flag, arg(help="also five scenes of ours that no training uses")] = False,
 ) -> None:
     """Render the scenes that are there and evaluate denoisers on them; tables and RUNS/benchmark.json."""
     from eval.bench.denoisers import parse_size
@@ -437,7 +445,10 @@ def benchmark_run(
 def benchmark_published(
     names: Denoisers, data: Annotated[Path, arg(metavar="DIR", help="made by `onespp import`")], runs: Runs = RUNS
 ) -> None:
-    """Score denoisers on other people's data by their own rules, beside the results that they published."""
+    """Score denoisers on other people's data by their own rules, beside the results that they published.
+
+    By default all that can run, networks as for `onespp eval`, with the budget "release".
+    """
     from eval.benchmark.published import published
 
     print(published(names, data, runs, "release"))
@@ -474,7 +485,7 @@ GROUPS: dict[str, Commands] = {
         },
     },
 }
-TITLE = "onespp: from a 3-D scene to a real-time Monte Carlo denoiser you can trust."
+TITLE = "onespp: from a 3-D scene to a Monte Carlo denoiser you can trust."
 MARGIN = 14  # characters left of the summaries
 SUMMARIES = {
     "bench": "Measure speed and memory of denoisers, and their lag after a light changes.",

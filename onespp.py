@@ -67,12 +67,13 @@ def read_frames(clip: Clip, denoiser: Denoiser, realisation: int = 0) -> Iterato
 
 
 def camera(K: ArrayLike, camera_to_world: ArrayLike) -> View:
-    """A camera: projection `K` (3, 3) and pose `camera_to_world` (4, 4), by the conventions of docs/format.md."""
-    import numpy as np
+    """A camera: projection `K` (3, 3) and pose `camera_to_world` (4, 4), by the conventions of docs/format.md.
 
-    from scenes.camera import View
+    Raises errors.BadInput where they are not that.
+    """
+    from denoise.arrays import camera_of
 
-    return View(np.asarray(K, np.float64), np.asarray(camera_to_world, np.float64), np.eye(4)[None])
+    return camera_of(K, camera_to_world)
 
 
 def frames(

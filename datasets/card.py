@@ -115,7 +115,7 @@ def page_of(card: dict[str, Any]) -> str:
         **{key: card[key] for key in ("profile", "seed", "command", "generator", "licence", "bytes")},
         clips=len(card["clips"]),
         versions=", ".join(f"{name} {version}" for name, version in card["versions"].items()),
-        reads=f" `--reads` left out {', '.join(left_out)}, but for tests." if left_out else "",
+        reads=f" Only test clips have {', '.join(left_out)} (`--reads`)." if left_out else "",
         options=", ".join(options) or "none",
         notes="".join(f"\n- Not as in the scene file: {note}." for note in card["notes"])
         + "".join(f"\n- With {credit}." for credit in card["models"].get("credits", [])),

@@ -62,7 +62,8 @@ def channels_of(frame: ImportedFrame, before: View | None) -> dict[str, NDArray[
     return {
         "direct": np.where(shown, frame.radiance, 0)[None],
         "indirect": dark[None],
-        "direct_reference": np.stack([np.where(shown, frame.reference, 0)] * 2),
+        # Readers add emission, which is the noisy radiance where nothing is shown.
+        "direct_reference": np.stack([frame.reference - np.where(shown, 0, frame.radiance)] * 2),
         "indirect_reference": np.stack([dark, dark]),
         "emission": np.where(shown, 0, frame.radiance),
         "albedo": np.where(shown, frame.albedo, 1),

@@ -27,8 +27,10 @@ def import_noisebase(source: Path, out: Path, samples: int) -> int:
     """Make a dataset of the sequences below `source`, with the first `samples` of each pixel. Returns how many.
 
     Raises BadInput, naming the file, where there is none, or one is missing, damaged, too small or of another size, or
-    has fewer samples.
+    has fewer samples; and for no samples.
     """
+    if samples < 1:
+        raise BadInput(f"--spp {samples}: use one sample per pixel or more")
     folders = sorted({path.parent for path in source.glob("**/frame*.zip") if FRAME.fullmatch(path.name)})
     if not folders:
         raise BadInput(f"{source} has no sequence: each is a folder with frame0000.zip and so on")

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from denoise.sources import Sources
 from errors import BadInput
 
 MAX_PAIRS = 4  # of frames that move, by which the convention of motion vectors is detected
-FRAMES = 12  # that are read at most to find them
+FRAMES = 12  # that are read at most to find them, or a camera
 
 Report = list[tuple[str, str]]  # a quantity, and where it comes from
 
@@ -40,11 +40,13 @@ def analyse(
     """Analyse the first frames of a foreign sequence for a denoiser that `reads` channels.
 
     `given` is the convention of motion vectors, and `albedo` "exact" or "sampled", if the user names them. Raises
-    BadInput for a channel that only onespp renders.
+    BadInput where they do not apply, for negative depth, and for a channel that only onespp renders.
     """
     check_reads("the denoiser", reads)
-    first, _ = read_foreign_frame(shots[0][0], sources)
-    conventions = camera_conventions(first)
+    frames = (read_foreign_frame(files, sources)[0] for files in islice(chain.from_iterable(shots), FRAMES))
+    first = next(frames)
+    first.check_depth()
+    conventions = camera_conventions(first, frames)
     report = [(quantity, str(sources.quantities[quantity])) for quantity in QUANTITIES if sources.has(quantity)]
     if sources.has("normal"):
         conventions = replace(conventions, normals_are_encoded=are_encoded(first.arrays["normal"], first.surface))
@@ -52,6 +54,10 @@ def analyse(
         convention, reason = motion_convention(shots, sources, given)
         conventions = replace(conventions, motion=convention)
         report.append(("convention", reason))
+    elif given:
+        raise BadInput(f"--motion {given}: there is no motion layer; name it by --layers motion=LAYER or --mv")
+    if albedo and not sources.has("albedo"):
+        raise BadInput(f"--albedo {albedo}: there is no albedo layer; name it by --layers albedo=LAYER or --alb")
     sampled = sources.has("albedo") and (albedo or usual_albedo(sources)) == "sampled"
     if sampled and conventions.has_history and {"albedo", "depth", "motion"} <= set(reads):
         conventions = replace(conventions, albedo_is_sampled=True)

@@ -13,6 +13,8 @@ from datasets.exr import silenced, write_file
 from datasets.writer import FLOAT16_MAX
 from errors import BadInput
 
+NOTE_ATTRIBUTE = "denoised"  # of the header of an output
+
 Window = tuple[int, int, int, int]  # left, top, right, bottom in pixels, the last two included
 
 
@@ -63,12 +65,14 @@ class ExrImage:
             self.windows |= dict.fromkeys(planes, window_of(part.header))
 
     def stacked(self, channels: Sequence[str]) -> NDArray[np.float32]:
-        """The named channels as one array (H, W, C). Raises BadInput where one is missing or has another window."""
+        """The named channels as one array (H, W, C). Raises BadInput where one is missing, deep or otherwise placed."""
         planes = []
         for name in channels:
             if name not in self.channels:
                 raise BadInput(f"{self.path} has no channel '{name}', which the first frame has")
             plane = self.channels[name].pixels
+            if plane.dtype == object:
+                raise BadInput(f"{self.path}: the channel '{name}' is deep: flatten the image")
             if plane.shape != (self.height, self.width) or self.windows[name] != self.window:
                 raise BadInput(f"{self.path}: the channel '{name}' is subsampled or has another size or data window")
             planes.append(plane.astype(np.float32))
@@ -97,6 +101,6 @@ class ExrImage:
                 self.windows[name] = self.windows[beside]
 
     def write(self, path: Path, note: str) -> None:
-        """Write everything atomically, with `note` as the attribute `denoised`. Raises BadInput where that fails."""
-        self.file.parts[0].header["denoised"] = note
+        """Write everything atomically, with `note` in the header. Raises BadInput where that fails."""
+        self.file.parts[0].header[NOTE_ATTRIBUTE] = note
         write_file(path, self.file)

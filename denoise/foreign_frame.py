@@ -17,7 +17,8 @@ from scenes.camera import View
 Image = NDArray[np.float32]
 
 MIN_SKY_DEPTH = 1e9  # from here on a pixel is background: Blender writes 1e10
-MAY_BE_INFINITE = ("depth", "distance", "position")  # at the background
+DEPTHS = ("depth", "distance")
+MAY_BE_INFINITE = (*DEPTHS, "position")  # at the background
 
 
 @dataclass
@@ -36,6 +37,18 @@ class ForeignFrame:
         """(H, W)."""
         height, width = self.surface.shape
         return height, width
+
+    @property
+    def has_depth(self) -> bool:
+        return any(name in self.arrays for name in DEPTHS)
+
+    def check_depth(self) -> None:
+        """Raise BadInput where no depth is positive, as along an axis toward the viewer: all would be background."""
+        for name in DEPTHS:
+            depth = self.arrays.get(name, np.zeros(0, np.float32))
+            near = depth[np.abs(depth) < MIN_SKY_DEPTH]
+            if (near < 0).any() and not (near > 0).any():
+                raise BadInput(f"{self.source}: the {name} is negative: change its sign, so that it grows away")
 
 
 def open_passes(files: FrameFiles, header_only: bool = False) -> dict[str, ExrImage]:
@@ -80,7 +93,7 @@ def make_finite(arrays: dict[str, Image]) -> int:
 
 def surface_of(arrays: dict[str, Image], alpha: Image | None) -> NDArray[np.bool_]:
     """Surface pixels (H, W): by distances, else positions, else normals and albedo; and by alpha, if any is above 0."""
-    ranges = [arrays[name][..., 0] for name in ("depth", "distance") if name in arrays]
+    ranges = [arrays[name][..., 0] for name in DEPTHS if name in arrays]
     if ranges:
         surface = (ranges[0] > 0) & (ranges[0] < MIN_SKY_DEPTH)
     elif "position" in arrays:

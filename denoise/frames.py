@@ -2,8 +2,9 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,8 +65,8 @@ class FrameViews(NamedTuple):
 
 def views_of(frame: ForeignFrame, conventions: InputConventions) -> FrameViews | None:
     """The camera of a frame; None where it is unknown."""
-    if frame.view is not None:
-        return FrameViews(frame.view, None)
+    if conventions.cameras == "arrays" and frame.view is not None:
+        return FrameViews(frame.view, None if frame.has_depth else frame.view)
     if conventions.cameras == "header":
         view = view_of_header(frame.header, *frame.size)
         return FrameViews(view, None) if view else None
@@ -76,18 +77,23 @@ def views_of(frame: ForeignFrame, conventions: InputConventions) -> FrameViews |
     return None
 
 
-def camera_conventions(first: ForeignFrame) -> InputConventions:
-    """Where the cameras of a sequence come from, by its first frame. Positions are preferred to the header."""
-    if "position" in first.arrays:
-        own = view_of_positions(first.arrays["position"], first.surface)
-        if own and is_own_space(own, first.header, first.arrays["position"], first.surface):
-            moved = in_the_world(own, first.header)
-            return InputConventions(cameras="positions" if moved else None, in_camera_space=True)
-        if own:
+def camera_conventions(first: ForeignFrame, others: Iterable[ForeignFrame] = ()) -> InputConventions:
+    """Where the cameras of a sequence come from, by its first frames. Positions are preferred to the header.
+
+    `others` are read as long as positions may be in the camera's own space, or show one plane alone: a camera in the
+    world may begin at the origin, or before a wall.
+    """
+    in_camera_space: InputConventions | None = None
+    for frame in chain([first], others) if "position" in first.arrays else ():
+        own = view_of_positions(frame.arrays["position"], frame.surface)
+        if own and not is_own_space(own, frame.header, frame.arrays["position"], frame.surface):
             return InputConventions(cameras="positions")
-    has_depth = "depth" in first.arrays or "distance" in first.arrays  # without, a camera does not locate surfaces
-    has_camera = has_depth and view_of_header(first.header, *first.size)
-    return InputConventions(cameras="header" if has_camera else None)
+        if own and not in_camera_space:
+            moved = in_the_world(own, frame.header)
+            in_camera_space = InputConventions(cameras="positions" if moved else None, in_camera_space=True)
+    # Without depth, a camera does not locate surfaces.
+    has_camera = first.has_depth and view_of_header(first.header, *first.size)
+    return in_camera_space or InputConventions(cameras="header" if has_camera else None)
 
 
 class FrameBuilder:
@@ -118,7 +124,8 @@ class FrameBuilder:
             given = self.conventions.motion.pixels(foreign.arrays["motion"])
             given = given if self.view is not None else np.zeros_like(given)
         view = views.world if views else self.parallel_view(foreign, depth, given)
-        before = self.view if self.view is not None else view
+        has_history = given is not None or views is not None
+        before = self.view if self.view is not None and has_history else view
         motion = given
         if motion is None:  # of a world in which nothing moves but the camera
             pixels, mesh_id = pixel_centres(*foreign.size), foreign.surface.astype(np.int64)
@@ -135,7 +142,7 @@ class FrameBuilder:
         }
         self.view = view
         self.depth = depth
-        previous = before if self.conventions.has_history else NOWHERE
+        previous = before if has_history else NOWHERE
         spp = self.spp * (2 if "buffer_b" in foreign.arrays else 1)
         return frame_of(channels, self.reads, view, previous, self.source, spp)
 
@@ -153,10 +160,10 @@ class FrameBuilder:
         """
         height, width = foreign.size
         K = np.array([[-TELEPHOTO, 0, width / 2], [0, -TELEPHOTO, height / 2], [0, 0, 1.0]])
-        if self.view is None or not self.conventions.has_history:
+        if self.view is None or motion is None:
             return View(K, facing_pose(self.given_normal(foreign), foreign.surface), STILL)
         pose = self.view.camera_to_world.copy()
-        if motion is not None and self.depth is not None and self.depth.shape == depth.shape:
+        if self.depth is not None and self.depth.shape == depth.shape:
             pose[:3, 3] += pose[:3, 2] * depth_change(depth, self.depth, motion)
         return View(K, pose, STILL)
 

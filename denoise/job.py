@@ -37,7 +37,7 @@ class Job:
     denoiser: Annotated[str, arg(metavar="DENOISER", help="NETWORK@BUDGET for weights in RUNS")] = "one"
     out: Annotated[Path, arg(metavar="DIR", help="output folder; frames keep their names")] = Path("denoised")
     weights: Annotated[Path | None, arg(metavar="FILE", aliases=["-w"], help="by default the shipped ones")] = None
-    hdr: Annotated[Patterns, arg(help="another name for the colour's files")] = ()
+    hdr: Annotated[Patterns, arg(help="files with the colour, as PATTERN")] = ()
     buffer_b: Annotated[Patterns, arg(help="sample buffer B of the same frames, for NAME+js")] = ()
     alb: Annotated[Patterns, arg(help="albedo in separate files")] = ()
     nrm: Annotated[Patterns, arg(help="normals in separate files")] = ()
@@ -48,11 +48,14 @@ class Job:
     layers: Annotated[tuple[str, ...], arg(metavar="QUANTITY=LAYER...", help=LAYERS_HELP)] = ()
     aov: Annotated[tuple[str, ...], arg(metavar="LAYER...", help=AOV_HELP)] = ()
     motion: Annotated[str | None, arg(metavar="PAIR,SIGNx,SIGNy,UNIT", help=MOTION_HELP)] = None
-    albedo: Annotated[Literal["exact", "sampled"] | None, arg(help=ALBEDO_HELP)] = None
+    albedo: Annotated[Literal["exact", "sampled"] | None, arg(metavar="{exact,sampled}", help=ALBEDO_HELP)] = None
     ref: Annotated[Patterns, arg(aliases=["-r"], help="references to compare with")] = ()
     frame_range: Annotated[str | None, arg(name="frames", metavar="A-B", help="frame numbers to denoise")] = None
     reset_at: Annotated[tuple[int, ...], arg(metavar="N...", help="frame numbers at which history is reset")] = ()
-    quality: Annotated[Literal["high", "balanced", "fast"] | None, arg(aliases=["-q"], help="of OIDN")] = None
+    quality: Annotated[
+        Literal["high", "balanced", "fast"] | None,
+        arg(metavar="{high,balanced,fast}", aliases=["-q"], help="of OIDN, where it is the denoiser"),
+    ] = None
     stored_as: Annotated[Literal["half", "float"] | None, arg(name="as", help="by default as in the input")] = None
     png: Annotated[Flag, arg(help="write a preview beside each frame")] = False
     spp: Annotated[float, arg(metavar="N", help="samples per pixel of the frames, of each buffer")] = 1.0

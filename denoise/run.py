@@ -16,7 +16,7 @@ from tqdm import tqdm
 from datasets.frame import Frame, to_image
 from datasets.tonemap import clip_exposure, display, luminance, to_8_bits
 from denoise.analysis import Analysis, analyse
-from denoise.exr_image import ExrImage
+from denoise.exr_image import NOTE_ATTRIBUTE, ExrImage
 from denoise.foreign_frame import open_passes, read_foreign_frame
 from denoise.frame_errors import ERRORS_FILE, METRICS_FILE, ErrorTable, FrameError, compare, radiance
 from denoise.frames import FrameBuilder, OwnFrameBuilder
@@ -24,7 +24,7 @@ from denoise.job import Job
 from denoise.layers import COLOUR, parse_layers
 from denoise.motion_convention import MotionConvention
 from denoise.parts import Parts
-from denoise.sequence import FrameFiles, files_of, gaps, like, numbered, sequence_of, split_at_cuts
+from denoise.sequence import FrameFiles, files_of, gaps, like, numbered, sequence_of, split_at_cuts, stamps_of
 from denoise.sources import Sources, find_sources, has_two_buffers
 from denoise.supersampling import AlbedoMean
 from errors import BadInput, requires_extra
@@ -55,6 +55,8 @@ def denoise(job: Job) -> None:
     shots = split_at_cuts(frames, job.reset_at)
     first = open_passes(frames[0], header_only=True)
     sources = find_sources(first, parse_layers(job.layers))
+    if sources.is_ours:
+        check_ours(job)
     name = parse_name(job.denoiser)
     spec = DenoiserSpec(name, "total", fastest_precision(name, job.device), job.weights, device=job.device)
     denoiser = build(spec, job.quality)
@@ -85,6 +87,13 @@ def build(spec: DenoiserSpec, quality: OIDNQuality | None) -> Denoiser:
             raise BadInput(f"--quality is an option of OIDN, not of '{spec.name}'")
         inner.quality = quality
     return denoiser
+
+
+def check_ours(job: Job) -> None:
+    """Raise BadInput for options that say what the files of `onespp exr` say themselves."""
+    for option, is_given in (("motion", job.motion), ("albedo", job.albedo), ("spp", job.spp != 1.0)):
+        if is_given:
+            raise BadInput(f"--{option} is for other renderers' files: those of `onespp exr` contain it; leave it out")
 
 
 def error_estimator(job: Job, denoiser: Denoiser, sources: Sources, first: ExrImage) -> JamesStein:
@@ -135,6 +144,15 @@ def check_settings(out: Path, settings: Mapping[str, Any]) -> None:
         raise BadInput(f"{out} has frames denoised with other settings ({', '.join(changed)}): choose another --out")
 
 
+def check_window(image: ExrImage, first: ExrImage) -> None:
+    """Raise BadInput where a frame's data window is not that of the first: motion is counted in its pixels."""
+    if (image.height, image.width) != (first.height, first.width):
+        raise BadInput(f"{image.path} is {image.width}x{image.height}, unlike the first frame: name one sequence")
+    if image.window != first.window:
+        windows = f"{image.path} begins at {image.window[:2]} and {first.path} at {first.window[:2]}"
+        raise BadInput(f"{windows}: render all frames with the same data window")
+
+
 @dataclass
 class SequenceDenoiser:
     job: Job
@@ -145,6 +163,12 @@ class SequenceDenoiser:
     shots: list[list[FrameFiles]]
     sources: Sources
     first: ExrImage  # the header of the first frame's colour
+
+    def __post_init__(self) -> None:
+        """Take the stamps before any frame is read: a file that is rendered again meanwhile gets another one."""
+        self.stamps = {
+            files.number: stamp for shot in self.shots for files, stamp in zip(shot, stamps_of(shot), strict=True)
+        }
 
     @cached_property
     def analysis(self) -> Analysis:
@@ -187,7 +211,7 @@ class SequenceDenoiser:
             "layers": sorted(job.layers),
             "aov": sorted(job.aov) or None,
             "albedo": job.albedo,
-            "motion": str(job.motion if self.sources.is_ours else self.analysis.conventions.motion),
+            "motion": str(None if self.sources.is_ours else self.analysis.conventions.motion),
             "as": job.stored_as,
             "spp": job.spp,
             "error": job.error or None,
@@ -206,12 +230,20 @@ class SequenceDenoiser:
                 yield from self.play_shot(shot, start, progress)
 
     def is_finished(self, files: FrameFiles) -> bool:
-        """Whether a frame's outputs, and its error if requested, are there and no older than its inputs."""
+        """Whether a frame's outputs, and its error if requested, are there and made of the files as they are now."""
         if self.estimator and not self.errors.has(files.number, self.job.until):
             return False
-        outputs = [self.job.out / files.name, *([self.preview(files)] if self.job.png else [])]
-        newest = max(path.stat().st_mtime for path in files.passes.values())
-        return all(path.exists() and path.stat().st_mtime >= newest for path in outputs)
+        output, preview = self.job.out / files.name, self.preview(files)
+        try:
+            note = ExrImage(output, header_only=True).header.get(NOTE_ATTRIBUTE)
+        except BadInput:  # it is missing or damaged
+            return False
+        has_preview = preview.exists() and preview.stat().st_mtime_ns >= output.stat().st_mtime_ns
+        return note == self.note(files) and (has_preview or not self.job.png)
+
+    def note(self, files: FrameFiles) -> str:
+        """By what a frame's output is made, and of which files."""
+        return f"onespp {self.job.denoiser} of {self.stamps[files.number]}"
 
     def preview(self, files: FrameFiles) -> Path:
         return (self.job.out / files.name).with_suffix(".png")
@@ -227,9 +259,7 @@ class SequenceDenoiser:
             needs_state = has_history and (index == 0 or type(state) is not State)
             if start < len(shot) and (needs_state or index >= start):
                 image, frame, nonfinite = self.read(files, builder)
-                if frame.size != (self.first.height, self.first.width):
-                    size = f"{image.width}x{image.height}"
-                    raise BadInput(f"{image.path} is {size}, unlike the first frame: name one sequence")
+                check_window(image, self.first)
                 frame = frame.to(self.denoiser.device)
                 if self.parts:
                     frame = self.parts.added(frame, image)
@@ -275,10 +305,10 @@ class SequenceDenoiser:
 
     def write(self, files: FrameFiles, image: ExrImage, radiance: NDArray[np.float32]) -> None:
         image.replace(self.sources.target, radiance, DTYPES[self.job.stored_as])
-        if self.job.png:
+        image.write(self.job.out / files.name, self.note(files))
+        if self.job.png:  # after the image: a preview that is older is of an image before
             from PIL import Image
 
             shown = display(np.nan_to_num(radiance).clip(0, None), self.exposure)
             with replacing(self.preview(files)) as temporary:
                 Image.fromarray(to_8_bits(shown)).save(temporary, "PNG")
-        image.write(self.job.out / files.name, f"onespp {self.job.denoiser}")

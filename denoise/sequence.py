@@ -1,6 +1,7 @@
 """Which files make which frames: patterns become a sequence, in the order of the frames' numbers."""
 
 import glob
+import hashlib
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,6 +10,8 @@ from pathlib import Path
 
 from denoise.layers import COLOUR
 from errors import BadInput
+
+FRAME_NUMBER = re.compile(r"(?:(?<![^._])-)?\d+")  # in the name of a file: a minus between words is a dash
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ def files_of(patterns: Sequence[str]) -> list[Path]:
 
 def numbered(paths: Sequence[Path]) -> dict[int, Path]:
     """Files by number: the last in their names that differs between all of them. Raises BadInput where none does."""
-    runs = [re.findall(r"\d+", path.stem) for path in paths]
+    runs = [FRAME_NUMBER.findall(path.stem) for path in paths]
     if len(paths) == 1:
         return {int(runs[0][-1]) if runs[0] else 0: paths[0]}
     for place in range(1, min(map(len, runs)) + 1):
@@ -74,8 +77,8 @@ def sequence_of(patterns: Mapping[str, Sequence[str]], numbers: str | None = Non
 def frame_range(text: str | None) -> tuple[int, int]:
     """(first, last) of "A-B" or "A"; all for None. Raises BadInput for any other text."""
     if text is None:
-        return 0, 2**62
-    match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
+        return -(2**62), 2**62
+    match = re.fullmatch(r"(-?\d+)(?:-(-?\d+))?", text)
     if not match:
         raise BadInput(f"'{text}' is not a range of frames such as 1-24")
     return int(match[1]), int(match[2] or match[1])
@@ -97,3 +100,14 @@ def split_at_cuts(frames: Sequence[FrameFiles], resets: Sequence[int]) -> list[l
             parts.append([])
         parts[-1].append(frame)
     return parts
+
+
+def stamps_of(shot: Sequence[FrameFiles]) -> list[str]:
+    """A text for each frame of a shot: another one if the size or time of one of its files, or of those before, is."""
+    digest = hashlib.sha256()
+    stamps = []
+    for frame in shot:
+        stats = [path.stat() for path in frame.passes.values()]
+        digest.update(repr([(stat.st_size, stat.st_mtime_ns) for stat in stats]).encode())
+        stamps.append(digest.hexdigest()[:16])
+    return stamps

@@ -73,7 +73,7 @@ def find_sources(images: Mapping[str, ExrImage], named: Mapping[str, str]) -> So
         if quantity in named:
             quantities[quantity] = Source(COLOUR, named_layer(quantity, named[quantity], channels, str(image.path)))
         elif quantity in images and quantity != COLOUR:
-            quantities[quantity] = Source(quantity, layer_of_pass(quantity, images[quantity]))
+            quantities[quantity] = Source(quantity, layer_of_pass(quantity, images[quantity], quantities.get(COLOUR)))
         elif layers := candidates(quantity, channels):
             best, *others = layers
             quantities[quantity] = Source(COLOUR, best, tuple(layer.name or "R,G,B" for layer in others))
@@ -86,9 +86,14 @@ def find_sources(images: Mapping[str, ExrImage], named: Mapping[str, str]) -> So
     return Sources(quantities, alpha, target_of(layer, channels), False)
 
 
-def layer_of_pass(quantity: str, image: ExrImage) -> ExrLayer:
-    """The layer in a file of one pass: called like the quantity, plain, or the first. Raises BadInput without."""
+def layer_of_pass(quantity: str, image: ExrImage, colour: Source | None) -> ExrLayer:
+    """The layer in a file of one pass: called like the quantity, plain, or the first. Raises BadInput without.
+
+    The other sample buffer has the layer of the `colour`, if it can.
+    """
     channels = list(image.channels)
+    if quantity == "buffer_b" and colour and image.channels.keys() >= {*colour.layer.channels}:
+        return colour.layer
     fitting = fitting_layers(quantity, channels)
     usual = [layer for name in PASS_LAYERS for layer in fitting if normalised(layer.name) == name]
     choice = [*candidates(quantity, channels), *usual, *fitting]

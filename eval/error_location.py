@@ -1,7 +1,8 @@
 """`onespp eval --where`: shares of the squared error by place, roughness, brightness and scale.
 
 Errors are those of displayed images. Their square is the product of the differences to both buffers of the reference,
-(x - A)(x - B), whose mean is the squared error without noise of the reference.
+(x - A)(x - B), whose mean is the squared error without noise of the reference, where that is too weak for clipping and
+gamma to bias A and B.
 """
 
 from collections import defaultdict

@@ -5,9 +5,10 @@ import multiprocessing
 import shutil
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from signal import SIG_IGN, SIGINT
@@ -35,6 +36,7 @@ from eval.results import (
 )
 from eval.selection import evaluated, with_indirect_baselines
 from eval.tables import results_table, table_by_age
+from files import locked
 from models.spec import DenoiserSpec
 from process import set_up_process
 from provenance import device_in_words
@@ -85,6 +87,16 @@ def evaluate_clip(clip: Clip, denoisers: Sequence[NamedDenoiser], runs: Path, qu
     for run in missing.values():
         run.result(clip).save(runs)
     return [load_result(folder) for folder in all_runs]
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder of results. Raises BadInput where another process has it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder / ".lock") as ours:
+        if not ours:
+            raise BadInput(f"another process is writing {folder}: wait for it or use another --runs")
+        yield
 
 
 def evaluate_in_worker(specs: list[DenoiserSpec], runs: Path, threads: int, clip: tuple[Path, bool]) -> None:
@@ -178,23 +190,23 @@ def evaluate(
 
     These go to RUNS/eval; names of PNGs of indirect light end in `-indirect`. Earlier results of the same clips,
     weights and code are reused. `first_hits` describes mirrors and glass by their own surfaces. Returns the content of
-    results.json. Raises BadInput where two data sets have clips of one name.
+    results.json. Raises BadInput where two data sets have clips of one name or another process writes there.
     """
     clips = [clip for path in data for clip in Dataset(path).clips("test", first_hits)]
     if twice := [name for name, count in Counter((clip.scene, clip.name) for clip in clips).items() if count > 1]:
         raise BadInput(f"{' and '.join(map(str, data))} both have {'/'.join(twice[0])}: evaluate them by themselves")
     specs = evaluated(names, runs, budget, device, clips)
     denoisers = named_denoisers(specs)
-    (runs / "eval").mkdir(parents=True, exist_ok=True)
-    missing = [clip for clip in clips if unfinished(clip, runs_through(clip, denoisers, runs))]
-    pixels = sum(clip.frames * clip.height * clip.width for clip in missing)
-    processes = min(processes, len(missing), math.ceil(pixels / smallest_share))
-    if processes > 1:
-        evaluate_in_processes(missing, specs, runs, processes)
-    results = [result for clip in clips for result in evaluate_clip(clip, denoisers, runs)]
-    weights = {spec.name: str(spec.weights) if spec.weights else None for spec in specs}
-    content = write_results(runs, data, device_in_words(device), results, weights, first_hits)
-    judged = list(by_clip(results))
-    save_sheets(runs, judged)
+    with writing(runs / "eval"):
+        missing = [clip for clip in clips if unfinished(clip, runs_through(clip, denoisers, runs))]
+        pixels = sum(clip.frames * clip.height * clip.width for clip in missing)
+        processes = min(processes, len(missing), math.ceil(pixels / smallest_share))
+        if processes > 1:
+            evaluate_in_processes(missing, specs, runs, processes)
+        results = [result for clip in clips for result in evaluate_clip(clip, denoisers, runs)]
+        weights = {spec.name: str(spec.weights) if spec.weights else None for spec in specs}
+        content = write_results(runs, data, device_in_words(device), results, weights, first_hits)
+        judged = list(by_clip(results))
+        save_sheets(runs, judged)
     print(f"{heading(content)}\n\n{results_table(judged)}\n\n{table_by_age(judged)}")
     return content

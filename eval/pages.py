@@ -18,7 +18,7 @@ from typing import Any
 from tabulate import tabulate
 
 from errors import BadInput
-from eval.metrics import METRICS, Values, means
+from eval.metrics import METRICS, Values, mean_floor, means
 from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
 from eval.tables import PRINTED, ClipScores, TableRow, clip_rows, mean_rows, source_of_denoiser, value_cell
 from eval.tradeoff.trades import Trade, psnr_front
@@ -66,6 +66,12 @@ def extract_keys(file: str, *keys: str) -> Callable[[Path], dict[str, Any]]:
     return lambda runs: {key: value for key, value in read_json(runs / file, keys).items() if key in keys}
 
 
+def extract_trade(runs: Path) -> dict[str, Any]:
+    content = extract_keys("report/trade.json", "device", "size", "threads", "clips", "samples")(runs)
+    rows = [row | {name: kept(row[name]) for name in ("metrics", "floors")} for row in content["samples"]]
+    return content | {"samples": rows}
+
+
 def extract_stress(runs: Path) -> dict[str, Any]:
     """The worst of all cases for each denoiser, and the requirements that it breaks."""
     content = read_json(runs / "stress" / "results.json")
@@ -83,8 +89,9 @@ def steady_clips(runs: Path, first: int) -> list[dict[str, Any]]:
     """Metrics of all denoisers in total light, and their noise floors, from frame `first` of each clip of 1 spp on."""
     rows = []
     for clip in of_one_spp([clip for clip in read_results(runs)[1] if clip.signal == "total"]):
-        values = {result.denoiser: result.frames[first:] for result in (*clip.results, clip.reference)}
-        rows.append({"scene": clip.scene, "clip": clip.clip, "results": {n: kept(means(f)) for n, f in values.items()}})
+        values = {result.denoiser: kept(means(result.frames[first:])) for result in clip.results}
+        values[NOISE_FLOOR] = kept(mean_floor(clip.reference.frames[first:]))
+        rows.append({"scene": clip.scene, "clip": clip.clip, "results": values})
     return rows
 
 
@@ -134,7 +141,7 @@ def extract_times(runs: Path) -> dict[str, Any]:
 EXTRACTS: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {  # the command that measures, and the extract
     "eval": ("onespp eval", extract_eval),
     "bench": ("onespp bench denoisers", extract_keys("bench/results.json", "device", "threads", "rows")),
-    "trade": ("onespp trade", extract_keys("report/trade.json", "device", "size", "threads", "clips", "samples")),
+    "trade": ("onespp trade", extract_trade),
     "stress": ("onespp stress --long", extract_stress),
     "times": ("make", extract_times),
     "benchmark": ("onespp benchmark run --scenes DIR", extract_benchmark),
@@ -267,7 +274,8 @@ def front() -> str:
         }
         for ms, row in psnr_front(rows, "total")
     ]
-    return table(lines)
+    untimed = dict.fromkeys(f"`{row.denoiser}`" for row in rows if row.signal == "total" and row.ms is None)
+    return table(lines) + (f"\nWithout a time: {', '.join(untimed)}.\n" if untimed else "")
 
 
 def mean_row(clips: Sequence[dict[str, Any]], denoiser: str) -> TableRow:
@@ -373,7 +381,7 @@ def stress() -> str:
     cases = sum(row["cases"] for row in rows.values())
     worst = max(row["violation"] for row in rows.values() if not row["broken"])
     text = f"{len(rows)} denoisers, {cases} cases; {len(lines) or 'none'} of them break a requirement."
-    return f"{text} The largest violation of a range by the others is {worst:.1g}.\n{table(lines) if lines else ''}"
+    return f"{text} The others leave their range by at most {worst:.1g}.\n{table(lines) if lines else ''}"
 
 
 def form_table(rows: list[dict[str, Any]]) -> str:

@@ -6,9 +6,7 @@ estimated error, `error-0000.webp` and so on. The folder `reference` contains th
 light end in `-indirect`.
 """
 
-import csv
 import hashlib
-import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -24,7 +22,7 @@ from datasets.frame import Signal
 from datasets.tonemap import to_8_bits
 from errors import BadInput, can_draw
 from eval.metrics import METRICS, Values
-from files import read_json, write_file, write_json
+from files import read_json, write_csv, write_json
 from provenance import DENOISING, code_digest, versions
 
 SIGNALS: tuple[Signal, ...] = ("total", "indirect")
@@ -164,13 +162,13 @@ def heading(content: Mapping[str, Any]) -> str:
 
 def write_frames(path: Path, results: list[Result]) -> None:
     """One line per frame of each result; noise floors are the values of a denoiser named "(noise floor)"."""
-    text = io.StringIO()
-    lines = csv.DictWriter(text, [*KEYS, "frame", *METRICS], extrasaction="ignore", lineterminator="\n")
-    lines.writeheader()
+    rows: list[list[object]] = []
     for result in results:
         facts = {name: getattr(result, name) for name in KEYS} | ({"denoiser": FLOOR} if result.floor else {})
-        lines.writerows(facts | {"frame": index} | values for index, values in enumerate(result.frames) if values)
-    write_file(path, text.getvalue().encode())
+        for index, values in enumerate(result.frames):
+            if values:
+                rows.append([*facts.values(), index, *map(values.get, METRICS)])
+    write_csv(path, [*KEYS, "frame", *METRICS], rows)
 
 
 @dataclass

@@ -39,7 +39,7 @@ class LayeredState(State):
 # Why filters without a network compute in float32 only.
 CLASSICAL = {dtype: "it has no network, and its sums need float32" for dtype in (torch.bfloat16, torch.float16)}
 
-NO_FLOAT16 = {torch.float16: "it is slower than float32 on processors, which bfloat16 is not"}  # of networks
+NO_FLOAT16 = {torch.float16: "on processors float32 and bfloat16 are faster"}  # of networks
 
 CONSTANT_TOLERANCE = 1e-3  # of a channel that counts as constant: more than float16 rounds
 
@@ -74,7 +74,7 @@ class Denoiser(nn.Module):
     reads: tuple[str, ...]  # channels it needs; nothing else is loaded, rendered or stored for it
     signal: Signal = "total"  # the light that it returns
     refuses: Mapping[torch.dtype, str] = MappingProxyType({})  # precisions that it does not compute in, with the reason
-    made_from: str = "paper"  # what it follows, for tables: others' papers, their authors' code, accounts of either
+    made_from: str = "ours"  # what it follows, for tables: others' papers, their authors' code, accounts of either
     is_network: bool = False  # whether it needs trained weights
     offline: bool = False  # whether a frame takes seconds: it runs only where it is named, not in runs of all
     convex: bool = False  # whether it returns weighted means of irradiance since the last reset, with weights >= 0
@@ -152,7 +152,7 @@ class Denoiser(nn.Module):
             names = list(self.inputs)
             first = sum(self.inputs[other] for other in names[: names.index(name)])
             for layer in self.first_layers():
-                drop_inputs(layer, first, self.dispensable[name](torch.tensor(constants[name])))
+                drop_inputs(layer, first, self.dispensable[name](torch.tensor(constants[name], dtype=torch.float32)))
             self.inputs = {other: count for other, count in self.inputs.items() if other != name}
             self.constants[name] = list(constants[name])
 

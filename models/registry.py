@@ -114,7 +114,7 @@ def parse_name(name: str | DenoiserName) -> DenoiserName:
     if parsed.base not in DENOISERS or not WRAPPERS.keys() >= {*parsed.wrappers}:
         raise BadInput(
             f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with "
-            "+accumulated, +taa and +js, and those that accumulate with +adaptive"
+            "+accumulated, +taa and +js, and those that filter `accumulated` with +adaptive"
         )
     if parsed.budget and not DENOISERS[parsed.base].is_network:
         raise BadInput(f"unknown denoiser '{name}': '{parsed.base}' has no weights, and so no @{parsed.budget}")

@@ -30,10 +30,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
     """The metadata that `save_weights` wrote: "denoiser", "recipe", "made_by", and "constants"."""
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata() or {}
-    read: dict[str, Any] = {key: text if key == "denoiser" else json.loads(text) for key, text in metadata.items()}
-    if "profile" in read.get("recipe", {}):  # the budget's key in the files that are shipped
-        read["recipe"]["budget"] = read["recipe"].pop("profile")
-    return read
+    return {key: text if key == "denoiser" else json.loads(text) for key, text in metadata.items()}
 
 
 def average_weights(denoiser: Denoiser, name: str, files: Sequence[Path], path: Path) -> None:
@@ -50,6 +47,8 @@ def average_weights(denoiser: Denoiser, name: str, files: Sequence[Path], path: 
         if "constants" in metadata:
             raise BadInput(f"{file} is specialised to one scene: average weights that take all inputs")
         sums = {key: tensor.double() + sums.get(key, 0) for key, tensor in denoiser.state_dict().items()}
+        if not {"recipe", "made_by"} <= metadata.keys():
+            raise BadInput(f"{file} does not state how it was trained: average weights that `onespp train` wrote")
         if "trainings" in metadata["recipe"]:
             raise BadInput(f"{file} is a mean itself: name the weights of its trainings")
         recipes.append(metadata["recipe"] | {"sha256": file_digest(file)})
@@ -66,6 +65,8 @@ def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:
     """Load a file, specialised as its metadata states. Raises BadInput if missing, damaged or of another network."""
     if not path.exists():
         raise BadInput(f"there are no weights at {path}: train them with `onespp train {name}`")
+    if path.is_dir():
+        raise BadInput(f"{path} is a folder: name the file of weights in it")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

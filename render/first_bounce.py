@@ -4,7 +4,7 @@ Axis-aligned filtering (Mehta et al. 2012, 2013) derives from them how fast ligh
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from render.backend import dr, mi
 from render.path import PathTracer, SampleRange
 from render.sampler import Sampler, hash32
-from render.stage import Stage
+from render.stage import Stage, T
 from scenes.camera import View
-
-T = TypeVar("T")
 
 UNIFORM_VARIANCE = 1 / 12  # of a uniform distribution over [0, 1]
 

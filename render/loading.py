@@ -16,7 +16,7 @@ from scenes.camera import Array
 from scenes.colours import Bsdf
 
 ArrayT = TypeVar("ArrayT", bound=dr.AnyArray)
-PLACE = "_place"  # where a file describes it: a key in descriptions that Mitsuba does not get
+PLACE = "_place"  # where a file describes it: Mitsuba does not get keys that begin with _
 
 
 def to_mitsuba(description: Mapping[str, Any], load: Callable[[Bsdf], object] | None = None) -> dict[str, Any]:
@@ -29,11 +29,13 @@ def to_mitsuba(description: Mapping[str, Any], load: Callable[[Bsdf], object] | 
             return mi.ScalarTransform4f(value)
         if key == "to_uv":
             return mi.ScalarTransform3f(value)
+        if isinstance(value, np.ndarray) and value.dtype == np.uint8:
+            return mi.Bitmap(value)
         if isinstance(value, np.ndarray):
             return mi.TensorXf(upload(np.float32(value).ravel()), value.shape)
         return value
 
-    return {key: convert(key, value) for key, value in description.items() if key != PLACE}
+    return {key: convert(key, value) for key, value in description.items() if not key.startswith("_")}
 
 
 def without_placement(bsdf: Bsdf, placements: list[Array]) -> Bsdf:
@@ -147,7 +149,7 @@ class StockLoader:
             loaded = self.made(to_mitsuba(self.scaled(description), self.load), what)
             self.loaded[id(description)] = (description, loaded)
             if isinstance(loaded, mi.Shape):
-                check_shape(loaded, what)
+                self.notes += check_shape(loaded, what)
                 (self.groups if loaded.class_name() == "ShapeGroupPlugin" else self.grouped).append(loaded)
         return self.loaded[id(description)][1]
 
@@ -170,7 +172,7 @@ class StockLoader:
         where = f"shape '{shape.name}'{shape.geometry.get(PLACE, '')}"
         where += f" ({shape.geometry['filename']})" if "filename" in shape.geometry else ""
         loaded = self.made(to_mitsuba(description, self.load), where)
-        check_shape(loaded, where)
+        self.notes += check_shape(loaded, where)
         return loaded
 
     def light(self, light: StockLight) -> mi.Emitter:
@@ -194,23 +196,57 @@ def mitsuba_reason(error: Exception) -> str:
 
 
 MAX_EXTENT = 1e18  # largest coordinate whose square is a finite float32
+BAD_NORMALS = "normals that are zero or not finite: computed ones instead"
+BAD_COORDINATES = "texture coordinates that are not finite: 0 instead"
 
 
-def check_shape(shape: mi.Shape, where: str) -> None:
-    """Raise BadInput, which begins with `where`, for an empty, damaged or unbounded shape."""
+def without_direction(normals: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which of `normals` (N, 3) float32 cannot normalise."""
+    length = np.linalg.norm(normals.astype(np.float64), axis=1)
+    return ~((length > 1 / MAX_EXTENT) & (length < MAX_EXTENT))
+
+
+def mend_mesh(mesh: mi.Mesh) -> list[str]:
+    """Replace what of a mesh would make pixels NaN. Returns notes."""
+    notes = []
+    parameters = mi.traverse(mesh)
+    normals = np.array(parameters["vertex_normals"]).reshape(-1, 3)
+    bad = without_direction(normals)
+    if bad.any() and bad[np.array(parameters["faces"])].any():
+        mesh.recompute_vertex_normals()
+        computed = np.array(mi.traverse(mesh)["vertex_normals"]).reshape(-1, 3)
+        parameters["vertex_normals"] = upload(np.where(bad[:, None], computed, normals).ravel())
+        notes.append(BAD_NORMALS)
+    uv = np.array(parameters["vertex_texcoords"])
+    if not np.isfinite(uv).all():
+        parameters["vertex_texcoords"] = upload(np.nan_to_num(uv, posinf=0, neginf=0))
+        notes.append(BAD_COORDINATES)
+    if notes:
+        parameters.update()
+    return notes
+
+
+def check_shape(shape: mi.Shape, where: str) -> list[str]:
+    """Raise BadInput, which begins with `where`, for an empty, damaged or unbounded shape.
+
+    Returns notes, which begin with it too, on what was mended instead.
+    """
     if not isinstance(shape, mi.Shape):
         raise BadInput(f"{where} is no shape")
     parameters = mi.traverse(shape)
-    if "faces" in parameters:
+    notes = []
+    if isinstance(shape, mi.Mesh) and "faces" in parameters:
         faces = np.array(parameters["faces"])
         vertices = np.array(parameters["vertex_positions"])
         if not len(faces) or 3 * faces.max() >= len(vertices):
             raise BadInput(f"{where} is empty or damaged: it has {len(vertices) // 3} vertices and no sound faces")
         if not np.isfinite(vertices).all():
             raise BadInput(f"{where} is damaged: it has vertices that are not finite")
+        notes = [f"{where}: {note}" for note in mend_mesh(shape)]
     box = shape.bbox()
     if shape.class_name() != "ShapeGroupPlugin" and not np.abs(corners(box)).max() < MAX_EXTENT:
         raise BadInput(f"{where} is too far away or too large: it reaches from {box.min} to {box.max}")
+    return notes
 
 
 def corners(box: mi.ScalarBoundingBox3f) -> Array:

@@ -81,8 +81,11 @@ class BsdfParameters(mi.TraversalCallback):
         return constant(float(np.sqrt(self.colour("alpha_u").mean() * self.colour("alpha_v").mean())))
 
     def colour(self, name: str) -> NDArray[np.float64]:
-        """The value (3,) of a constant texture."""
-        return np.array(self.textures[name].eval(dr.zeros(mi.SurfaceInteraction3f)), np.float64)[:, 0]
+        """The value (3,) of a constant texture, the mean of another."""
+        texture = self.textures[name]
+        if texture.is_spatially_varying():
+            return np.full(3, mean_of(texture))
+        return np.array(texture.eval(dr.zeros(mi.SurfaceInteraction3f)), np.float64)[:, 0]
 
 
 def reflectance_at_normal(eta: float) -> float:
@@ -101,7 +104,8 @@ def plastic_material(parameters: BsdfParameters) -> Material:
     nonlinear = "nonlinear = 1" in str(parameters.bsdf)
     internal = float(np.array(mi.fresnel_diffuse_reflectance(mi.Float(1 / eta)))[0]) if nonlinear else 0.0
     base = parameters.textures["diffuse_reflectance"]
-    return Material(base, alpha, constant(0), UNSCALED, reflectance_at_normal(eta), internal=internal)
+    gloss = parameters.colour("specular_reflectance").mean() if "specular_reflectance" in parameters.textures else 1.0
+    return Material(base, alpha, constant(0), UNSCALED, gloss * reflectance_at_normal(eta), internal=internal)
 
 
 def conductor_material(parameters: BsdfParameters) -> Material:

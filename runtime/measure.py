@@ -229,7 +229,7 @@ def main(size: str = "1280x720", runs: str = "runs") -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 3:
+    if len(sys.argv) > 3 or any(text.startswith("-") for text in sys.argv):
         sys.exit(__doc__)
     with exits_in_words():
         main(*sys.argv[1:])

@@ -3,6 +3,7 @@
 `python -m runtime.weights` writes runtime/onespp_weights.h.
 """
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -63,4 +64,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    if sys.argv[1:]:
+        sys.exit(__doc__)
     main()

@@ -75,6 +75,11 @@ def look_at(eye: Array, target: Array, up: Array = Y_UP) -> Array:
     return matrix
 
 
+def up_of(axes: Array, wanted: Array) -> Array:
+    """The `wanted` up (3,), or the image's own if the camera with these `axes` (3, 3) is rolled against it."""
+    return wanted if abs(wanted @ axes[:, 0]) < 1e-3 * (wanted @ axes[:, 1]) else axes[:, 1]
+
+
 def axis_rotation(axis: int, angle: float) -> Array:
     """The rotation (3, 3) by `angle` radians about the x, y or z axis (`axis` 0, 1, 2)."""
     i, j = (axis + 1) % 3, (axis + 2) % 3

@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -89,11 +90,17 @@ def test_options_that_would_do_nothing(capsys, tmp_path):
     assert "leave one of them out" in fails(capsys, *average, "--card", file)
 
 
-@pytest.mark.skipif(not shutil.which("make"), reason="needs make")
+def made(folder: Path, *arguments: str) -> str:
+    """The commands of a call of make."""
+    if not shutil.which("make"):
+        pytest.skip("needs make")
+    command = ["make", "--dry-run", "-C", folder, "-f", ROOT / "Makefile", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
 def test_make_keeps_its_time_where_it_does_everything_but_set_up(tmp_path):
-    def keeps() -> bool:
-        command = ["make", "--dry-run", "-C", tmp_path, "-f", ROOT / "Makefile", "all"]
-        return "make.seconds" in subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    def keeps(target: str = "all", file: str = "make.seconds") -> bool:
+        return f"> runs/{file}" in made(tmp_path, target)
 
     (tmp_path / "pyproject.toml").touch()
     assert not keeps()  # it sets up first
@@ -103,6 +110,19 @@ def test_make_keeps_its_time_where_it_does_everything_but_set_up(tmp_path):
     assert keeps()
     (tmp_path / "data" / "quick").mkdir(parents=True)
     assert not keeps()
+    assert not keeps("test", "test.seconds")  # it would not follow a `make`
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "make.seconds").touch()
+    assert keeps("test", "test.seconds")
+    (tmp_path / "runs" / "test.seconds").touch()
+    assert not keeps("test", "test.seconds")  # its kernels are compiled
+
+
+@pytest.mark.parametrize("profile", DATA_PROFILES)
+def test_make_trains_with_a_budget_whatever_the_profile(tmp_path, profile):
+    (tmp_path / "pyproject.toml").touch()
+    budget = profile if profile in {budget for _, budget in RECIPES} else "quick"
+    assert f"onespp train --budget {budget} --data data/{profile} " in made(tmp_path, "train", f"PROFILE={profile}")
 
 
 def test_unknown_names(capsys, tiny, tmp_path):

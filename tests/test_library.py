@@ -11,7 +11,7 @@ from errors import BadInput
 from models.registry import create
 from models.weights import save_weights
 from provenance import ROOT
-from scenes.camera import intrinsics, look_at
+from scenes.camera import intrinsics, look_at, pixel_centres, unproject
 
 PAGE = (ROOT / "docs" / "library.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
@@ -66,21 +66,33 @@ def test_without_motion_and_cameras_there_is_no_history():
     np.testing.assert_allclose(last, arrays(2)["colour"], rtol=1e-6)
 
 
-def test_motion_from_cameras_and_depth():
-    """A wall at depth 5, its camera moved by 0.1 to the right: it moves by focal length · 0.1 / 5 pixels."""
-    size = (24, 32)
-    K = intrinsics(60.0, *size)
+def wall(index: int, geometry: str | None, size: tuple[int, int] = (24, 32)) -> dict:
+    """A wall at depth 5, its camera moved by 0.1 to the right."""
+    eye = np.array([0.1 * index, 0.0, 7.0])
+    camera = onespp.camera(intrinsics(60.0, *size), look_at(eye, eye - [0.0, 0.0, 1.0]))
+    points = unproject(pixel_centres(*size), np.full(size, 5.0), camera)
+    distance = np.linalg.norm(points - eye, axis=-1, keepdims=True)
+    geometries = {"depth": np.full((*size, 1), 5.0), "distance": distance, "position": points}
+    given = {geometry: geometries[geometry]} if geometry else {}
+    return {"colour": arrays(index, size)["colour"], "camera": camera} | given
 
-    def wall(index: int) -> dict:
-        eye = np.array([0.1 * index, 0.0, 0.0])
-        camera = onespp.camera(K, look_at(eye, eye - [0.0, 0.0, 1.0]))
-        return {"colour": arrays(index, size)["colour"], "depth": np.full((*size, 1), 5.0), "camera": camera}
 
-    first, second = onespp.frames(map(wall, range(2)), onespp.load("accumulated"))
+@pytest.mark.parametrize("geometry", ["depth", "distance", "position"])
+def test_motion_from_cameras_and_depth(geometry):
+    """The wall moves by focal length · 0.1 / 5 pixels."""
+    first, second = onespp.frames((wall(index, geometry) for index in range(2)), onespp.load("accumulated"))
+    K = intrinsics(60.0, 24, 32)
     assert (first.motion == 0).all()
+    np.testing.assert_allclose(second.depth, 5, rtol=1e-5)
     np.testing.assert_allclose(second.motion[0, 0], -K[0, 0] * 0.1 / 5, rtol=1e-5)
     np.testing.assert_allclose(second.motion[0, 1], 0, atol=1e-5)
     np.testing.assert_allclose(second.normal[0, 2], 1, rtol=1e-5)
+
+
+def test_a_camera_without_depth_gives_no_history():
+    denoiser = onespp.load("accumulated")
+    *_, last = onespp.denoise(denoiser, onespp.frames((wall(index, None) for index in range(3)), denoiser))
+    np.testing.assert_allclose(last, arrays(2)["colour"], rtol=1e-6)
 
 
 def test_bad_pixels_and_background_of_own_arrays():
@@ -106,13 +118,43 @@ def test_bad_pixels_and_background_of_own_arrays():
         ({"depth": np.zeros((24, 32, 3))}, r"'depth' has the shape \(24, 32, 3\), not \(24, 32, 1\)"),
         ({"colours": np.zeros((24, 32, 3))}, "unknown quantity 'colours'"),
         ({"camera": (np.eye(3), np.eye(4))}, "'camera' is of type tuple: make it by onespp.camera"),
+        ({"camera": None}, "'camera' is of type NoneType"),
+        ({"colour": "x"}, "'colour' has no real numbers, but <U1"),
+        ({"colour": np.ones((24, 32, 3), complex)}, "'colour' has no real numbers, but complex"),
+        ({"colour": torch.ones((24, 32, 3), requires_grad=True)}, "'colour' is no array .*detach"),
+        ({"colour": torch.ones((24, 32, 3), dtype=torch.bfloat16)}, "'colour' is no array .* BFloat16"),
+        ({"colour": np.ones((0, 32, 3)), "motion": np.ones((0, 32, 2))}, "'colour' has no pixels"),
+        ({"depth": np.full((24, 32, 1), -1.0)}, "the depth is negative: change its sign"),
     ],
 )
 def test_unusable_arrays_are_named(changes, message):
     with pytest.raises(BadInput, match=message):
         next(onespp.frames([arrays(0) | changes], onespp.load("noisy")))
+    with pytest.raises(BadInput, match="frame 0 of the arrays is of type str"):
+        next(onespp.frames(arrays(0), onespp.load("noisy")))
     with pytest.raises(BadInput, match="frame 1 of the arrays: 'motion'"):
         [*onespp.frames([arrays(0), {"colour": np.zeros((24, 32, 3))}], onespp.load("noisy"))]
+
+
+K = intrinsics(60.0, 24, 32)
+
+
+@pytest.mark.parametrize(
+    ("K", "pose", "message"),
+    [
+        (np.eye(4), np.eye(4), "K of a camera has to be 3 x 3"),
+        (K, np.eye(4)[:3], "camera_to_world of a camera has to be 4 x 4"),
+        (np.nan * K, np.eye(4), "K .* finite"),
+        (np.zeros((3, 3)), np.eye(4), "negative focal lengths"),
+        (-K, np.eye(4), "negative focal lengths"),
+        (K + np.eye(3, k=1), np.eye(4), "no shear"),
+        (K, 2 * np.eye(4), "rotation and translation"),
+        (K, np.full((4, 4), "x"), "camera_to_world of a camera has no real numbers"),
+    ],
+)
+def test_unusable_cameras_are_named(K, pose, message):
+    with pytest.raises(BadInput, match=message):
+        onespp.camera(K, pose)
 
 
 def test_denoisers_of_what_arrays_lack_are_refused():

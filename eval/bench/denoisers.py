@@ -26,7 +26,7 @@ from models.registry import DENOISERS, DenoiserName, parse_name, prototype
 from models.spec import DenoiserSpec, fastest_precision, precisions_of
 from models.wrappers.wrapper import unwrapped
 from process import keep_freed_memory
-from provenance import DENOISING, code_digest, device_in_words, versions
+from provenance import DENOISING, MadeBy, code_digest, device_in_words, versions
 from timing import device_clock, take_turns, thread_count
 
 BASELINE = "oidn"  # the denoiser that times are divided by
@@ -243,6 +243,11 @@ def cost(timed: TimedDenoiser, size: Size, peak_mb: float | None) -> DenoiserCos
     )
 
 
+def timed_with() -> MadeBy:
+    """The packages and the code that times depend on; this module imports all denoisers."""
+    return {"versions": versions(DENOISING), "code": code_digest(__name__)}
+
+
 def results_file(runs: Path, device: str = "cpu") -> Path:
     """The file of the times on a device, "cpu" or "cuda"."""
     return runs / "bench" / ("results.json" if device == "cpu" else f"results-{device}.json")
@@ -277,6 +282,7 @@ def bench_denoisers(
             "schema": 1,
             "device": device_in_words(device, counts[-1]),
             "threads": counts[-1],  # of the last rows of each size
+            "made_by": timed_with(),
             "rows": [asdict(row) for row in rows],
         }
         write_json(path, content)
@@ -294,12 +300,10 @@ def measure_rows(
     measured: int = TIMED_FRAMES,
 ) -> Iterator[list[DenoiserCost]]:
     """Yield the rows of each size and number of threads; those of the same call in `unfinished` are reused."""
-    modules = {module for spec in specs for module in spec.modules}
     call = {
         "specs": [repr(spec) for spec in specs],
         "frames": measured,
-        "code": code_digest(__name__, *sorted(modules)),
-        "versions": versions(DENOISING),
+        "made_by": timed_with(),
         "device": device_in_words(specs[0].device),
     }
     before = read_json(unfinished, ("call", "rows")) if unfinished.exists() else {}

@@ -127,7 +127,8 @@ def bench_light(runs: Path, names: Sequence[str], budget: str) -> str:
     lags = {}
     for spec in tqdm(specs, "denoisers", unit="denoiser"):
         denoiser = spec.build()
-        lags[spec.name] = {change: psnr_of_frames(denoiser, clip, exposure) for change, clip in clips.items()}
+        name = spec.name if spec.returns == "total" else f"{spec.name} ({spec.returns})"
+        lags[name] = {change: psnr_of_frames(denoiser, clip, exposure) for change, clip in clips.items()}
     save_figure(folder / "plot.png", lag_figure(lags))
     table = lag_table(lags)
     write_file(folder / "table.md", f"{table}\n".encode())

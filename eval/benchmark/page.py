@@ -28,12 +28,15 @@ def video(clip: Clip, spec: DenoiserSpec) -> list[str]:
 def write_page(names: tuple[str, str], data: Sequence[Path], runs: Path, budget: str) -> Path:
     """Write RUNS/compare.html, one file that works offline. Returns its path.
 
-    Raises BadInput as `onespp eval`, and for one denoiser named twice.
+    Raises BadInput as `onespp eval`, and for one denoiser named twice or two of different light.
     """
     played = [clip for folder in data for clip in Dataset(folder).clips("test")]
     specs = evaluated(names, runs, budget, clips=played)
     if len(specs) < 2:
         raise BadInput(f"{names[0]} is named twice: name two denoisers to compare")
+    if specs[0].returns != specs[1].returns:
+        lights = " and ".join(f"{spec.name} {spec.returns}" for spec in specs)
+        raise BadInput(f"{lights} light are different images: name two denoisers of one light")
     clips = [
         {
             "name": f"{clip.scene}/{clip.name}",

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from datasets.channels import REFERENCE_CHANNELS
 from datasets.clip import Clip, is_clip
-from datasets.frame import Frame, read_frame
+from datasets.frame import Signal, read_frame, to_tensor
 from datasets.tonemap import psnr
 from errors import BadInput
 from eval.clip_run import as_displayed
@@ -90,12 +90,11 @@ class DenoiserView:
     # of its state after each shown frame, by name: (H, W, 3) in [0, 1], or numbers (H, W)
     pictures: dict[str, list[NDArray[np.floating]]] = field(default_factory=dict)
 
-    def keep(self, output: Tensor, frame: Frame, exposure: float) -> None:
+    def keep(self, output: Tensor, reference: Tensor | None, exposure: float) -> None:
         image = as_displayed(output, exposure)
         signal = self.denoiser.signal
         caption = self.name if signal == "total" else f"{self.name} ({signal})"
-        if frame.channels.keys() >= set(REFERENCE_CHANNELS):
-            reference = frame.remodulate(frame.reference_irradiance(signal), signal)
+        if reference is not None:
             difference = image - as_displayed(reference, exposure)
             mse = float((difference**2).mean())
             caption += f"\nRMSE {mse**0.5:.4f}  {psnr(mse):.2f} dB"
@@ -126,19 +125,20 @@ def runnable(clip: Clip, runs: Path, budget: str, names: Sequence[str]) -> dict[
 def view_clip(clip: Clip, denoisers: Mapping[str, Denoiser], shown: Sequence[int]) -> tuple[list[DenoiserView], Column]:
     """Run the denoisers over the clip. Returns their views of the `shown` frames, and references if there are any."""
     views = [DenoiserView(name, denoiser) for name, denoiser in denoisers.items()]
-    channels = {channel for denoiser in denoisers.values() for channel in denoiser.reads}
+    channels = sorted({channel for denoiser in denoisers.values() for channel in denoiser.reads})
+    signals: set[Signal] = {"total", *(denoiser.signal for denoiser in denoisers.values())}
     has_reference = all(channel in clip.channels for channel in REFERENCE_CHANNELS)
     references: Column = []
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
-        wanted = channels | {*REFERENCE_CHANNELS, "albedo", "depth"} if has_reference and index in shown else channels
-        frame = read_frame(clip, index, sorted(wanted))
+        frame = read_frame(clip, index, channels)
+        truth: dict[Signal, Tensor] = {}
+        if has_reference and index in shown:
+            truth = {signal: to_tensor(clip.reference(index, signal).mean(axis=0)) for signal in signals}
+            references.append(Panel(as_displayed(truth["total"], clip.exposure), "reference"))
         for view in views:
             output, view.state = view.denoiser(frame, view.state)
             if index in shown:
-                view.keep(output, frame, clip.exposure)
-        if has_reference and index in shown:
-            reference = frame.remodulate(frame.reference_irradiance("total"), "total")
-            references.append(Panel(as_displayed(reference, clip.exposure), "reference"))
+                view.keep(output, truth.get(view.denoiser.signal), clip.exposure)
     return views, references
 
 

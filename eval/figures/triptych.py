@@ -52,7 +52,7 @@ def in_strips(pictures: Sequence[Picture]) -> Picture:
 
 
 def triptych(
-    out: Path,
+    out: Path = Path("triptych.png"),
     scene_name: str = "room-2014",
     denoiser: str = "one",
     runs: Path = Path("runs"),

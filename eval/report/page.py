@@ -143,6 +143,8 @@ def trade_plots(times: Times, clips: Sequence[ClipResults]) -> list[dict[str, An
 def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, megabytes: float, live: bool) -> str:
     """The page; `live` says whether to link to LIVE_PAGE."""
     times = times_of_first_size(runs)
+    for warning in times.warnings if times else ():
+        print(warning)
     paths = (path for clip in clips for folder in folders_of(runs, clip).values() for path in folder.glob("*.webp"))
     size = sum(path.stat().st_size for path in paths) * WITH_FLIP_MAPS * BASE64
     step = max(1, math.ceil(size / (megabytes * 1e6)))

@@ -14,7 +14,7 @@ from datasets.clip import Clip, Dataset
 from errors import BadInput
 from eval.bench.denoisers import parse_size
 from eval.clip_run import NamedDenoiser
-from eval.harness import clips_of_one_spp, evaluate_clip
+from eval.harness import clips_of_one_spp, evaluate_clip, writing
 from eval.metrics import METRICS
 from eval.results import ClipResults, Result, by_clip
 from eval.selection import baselines, cannot_run, choose, untrained, weights_file, with_indirect_baselines
@@ -43,12 +43,13 @@ def trade(
 
     Returns tables; writes RUNS/report/trade.json and a figure. Times are those of RUNS/bench at `size`, by default that
     of the clips, and `threads`. Clips and results are stored in RUNS/trade and reused. Raises BadInput where there are
-    no times or clips, for a bad size or numbers of samples, and as `candidates`.
+    no times or clips, for times of another device, a bad size or numbers of samples, and as `candidates`.
     """
     check_levels(levels)
     dataset = Dataset(data)
     clips = clips_of_one_spp(dataset)
     times = Times(runs, parse_size(size) if size else (clips[0].height, clips[0].width), threads, RENDERER)
+    times.check_device()
     chosen = candidates(names, runs, budget)
     folder = runs / "trade"
 
@@ -113,14 +114,18 @@ def with_more_samples(chosen: Sequence[DenoiserSpec], named: bool) -> list[Denoi
 def results_by_spp(
     specs: Sequence[DenoiserSpec], clips: Sequence[Clip], dataset: Dataset, levels: Sequence[int], folder: Path
 ) -> dict[int, list[ClipResults]]:
-    """Results on the clips by samples per pixel; clips and results are stored in `folder`."""
+    """Results on the clips by samples per pixel; clips and results are stored in `folder`.
+
+    Raises BadInput where another process writes there.
+    """
     denoisers = [NamedDenoiser(spec, spec.label) for spec in specs]
     with_buffers = any(not set(SAMPLE_BUFFERS.values()).isdisjoint(spec.facts.reads) for spec in specs)
     results: dict[int, list[Result]] = {spp: [] for spp in levels}
     jobs = [(clip, spp) for clip in clips for spp in levels]
-    for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):
-        fed = with_samples(clip, dataset, spp, folder / "data", with_buffers)
-        results[spp] += evaluate_clip(fed, denoisers, folder)
+    with writing(folder):
+        for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):
+            fed = with_samples(clip, dataset, spp, folder / "data", with_buffers)
+            results[spp] += evaluate_clip(fed, denoisers, folder)
     return {spp: list(by_clip(ours)) for spp, ours in results.items()}
 
 
@@ -163,7 +168,7 @@ def draw_samples(rows: Sequence[Trade], title: str) -> Figure:
 
 
 def tables(rows: Sequence[Trade], sample_rows: Sequence[Trade], title: str, times: Times) -> str:
-    parts = [title, FRONTS]
+    parts = [title, *times.warnings, FRONTS]
     for signal in dict.fromkeys(row.signal for row in rows):
         parts.append(f"{signal} light\n{front_table([row for row in rows if row.signal == signal])}")
     if untimed := [row.label for row in rows if row.ms is None]:

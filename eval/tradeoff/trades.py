@@ -10,12 +10,13 @@ from tabulate import tabulate
 
 from datasets.frame import Signal
 from errors import BadInput
-from eval.bench.denoisers import Size, results_file, size_name
+from eval.bench.denoisers import Size, results_file, size_name, timed_with
 from eval.metrics import METRICS, Values
 from eval.results import ClipResults, by_signal
 from eval.tables import scores_of, source_of_denoiser, value_cell, with_legend
 from files import read_json
 from models.spec import DenoiserSpec
+from provenance import device_in_words
 
 TRADED = ("psnr", "ssim", "rmse")
 
@@ -28,6 +29,8 @@ class Times:
 
     def __init__(self, runs: Path, size: Size, threads: int | None = None, device: str = "cpu"):
         path = results_file(runs, device)
+        self.path = path
+        self.kind = device
         self.size = size
         self.name = size_name(size)
         self.runs = runs
@@ -36,7 +39,8 @@ class Times:
             raise BadInput(f"there are no times at {path}: measure them with `{command}`")
         bench = read_json(path, ("device", "threads", "rows"))
         self.device: str = bench["device"]
-        self.threads: int = threads or bench["threads"]
+        self.most_threads: int = bench["threads"]
+        self.threads: int = threads or self.most_threads
         self.rows: list[dict[str, Any]] = bench["rows"]
         # By the bench's name of the denoiser, and precision.
         self.ms: dict[tuple[str, str], float] = {
@@ -48,6 +52,20 @@ class Times:
             raise BadInput(
                 f"{path} has no times of {self.name} with {self.threads} threads: measure them with "
                 f"`{self.command()}`, or name a size that it has with --size"
+            )
+
+        # Of code or packages that have changed since; files of older versions do not tell.
+        self.warnings: list[str] = []
+        if bench.get("made_by", timed_with()) != timed_with():
+            self.warnings = [f"{path} has times of other code or packages: measure again with `{self.command()}`"]
+
+    def check_device(self) -> None:
+        """Raise BadInput where they were measured on another device than that of this process."""
+        here = device_in_words(self.kind, self.most_threads)
+        if self.device != here:
+            raise BadInput(
+                f"{self.path} has times of {self.device}, which do not compare with rendering on {here}: measure them "
+                f"here with `{self.command()}`"
             )
 
     def command(self, names: Iterable[str] = ()) -> str:

@@ -47,6 +47,7 @@ class Accumulating(Denoiser):
 class Accumulated(Accumulating):
     """Temporal accumulation of irradiance along motion vectors (SVGF §4.1), without a spatial filter."""
 
+    made_from = "paper"
     refuses = CLASSICAL
     convex = True
     baseline_for: tuple[Signal, ...] = ("total", "indirect")

@@ -165,6 +165,7 @@ class NTD(Denoiser):
     unless it is created for "total".
     """
 
+    made_from = "paper"
     # the motion channel by which the previous output is reprojected
     vectors: ClassVar[Literal["motion", "dual_motion"]] = "dual_motion"
     # Traditional vectors are needed for the disocclusion mask of the loss.

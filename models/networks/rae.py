@@ -17,7 +17,7 @@ from models.operators import pad_to_multiple
 POWER = 0.2  # §4.4: inputs and targets are raised to it before anything else
 SLOPE = 0.1  # §5.3: leaky ReLU
 MIN_SLOPE_AT = 0.01  # exposed irradiance, below which `raised` has no flatter slope
-ENCODER = (32, 32, 43, 57, 76, 101, 101)  # widths; ours, like the decoder's: the paper does not print its own
+ENCODER = (32, 32, 43, 57, 76, 101, 101)  # widths: 4/3 after each subsampling (§5.1), but not 135 at the last
 DECODER = ((76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
 RAE_INPUTS = {"colour": 3, "normal": 2, "depth": 1, "roughness": 1}  # of the network, and their channels (§3.2)
 
@@ -103,6 +103,7 @@ class RAEState(State):
 class RAE(Denoiser):
     """Denoises irradiance from 7 channels: irradiance, view-space normal x and y, depth, roughness (§3.2)."""
 
+    made_from = "paper"
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness")
     is_network = True
     has_kernels = False

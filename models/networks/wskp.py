@@ -50,7 +50,8 @@ def network_features(
     """The network's input (B, 10, H, W) in [0, 1] (§5.1), or fewer channels for some `names` of FEATURE_CHANNELS only.
 
     Accumulated `irradiance` (B, 3, H, W), modulated and displayed (causal exposure, clipped, gamma 2.2); albedo; the
-    world-space normal scaled to [0, 1]; the depth d / (d + s) with s its running `scale`.
+    world-space normal scaled to [0, 1]; the depth d / (d + s) with s its running `scale`, where the paper scales
+    it linearly.
     """
     exposed = irradiance * frame.divisor * (scale.exposure() * frame.gain)
     return feature_images(exposed, frame.albedo, frame.normal, scale.normalised_depth(frame.depth), names)
@@ -82,6 +83,7 @@ class FilteredState(AccumulatedState):
 class KernelPredictor(Accumulating):
     """Temporal accumulation, a network that predicts filter parameters, the filter on irradiance, remodulation (§4)."""
 
+    made_from = "paper"
     is_network = True
     inputs: Mapping[str, int] = FEATURE_CHANNELS
     dispensable: ClassVar = {"albedo": nn.Identity(), "normal": scaled_normal}

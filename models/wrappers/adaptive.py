@@ -149,12 +149,13 @@ def accumulate_adaptively(frame: Frame, irradiance: Tensor, previous: Accumulati
 
 
 class Adaptive(Wrapper):
-    """The same denoiser on adaptively accumulated frames. Raises BadInput for one that does not accumulate."""
+    """The same denoiser on adaptively accumulated frames. Raises BadInput for one of other input than `accumulated`."""
 
     def __init__(self, inner: Denoiser):
         if not isinstance(inner, Accumulating):
             raise BadInput(
-                f"{type(inner).__name__} does not accumulate: leave out +adaptive, or put +accumulated before it"
+                f"{type(inner).__name__} does not filter what `accumulated` returns, which +adaptive replaces: leave "
+                "+adaptive out, or put +accumulated before it"
             )
         super().__init__(inner)
         inner.accumulation = accumulate_adaptively

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
@@ -16,6 +17,7 @@ from render.clip import NO_OPTIONS, Options, Sampling, timed, write_clip
 from render.job.pilots import choose_rooms, samples_needed
 from render.job.plan import plan, rarity_of_clip, scene_of_clip
 from render.job.profiles import DataProfile, profile_of
+from render.scene_file.load import TRACED
 
 
 def share_of(clips: Sequence[Path], part: str) -> Sequence[Path]:
@@ -79,10 +81,20 @@ def begun(root: Path, profile: str, seed: int, reads: Sequence[str], options: Op
     dataset = Dataset(root)
     # Notes, too: a texture that was missing may have come.
     for key in ("profile", "seed", "generator", "models", "splits", "channels", "options", "source", "notes"):
-        if dataset.facts.get(key, {}) != wanted[key]:
+        if portable(key, dataset.facts.get(key, {})) != portable(key, wanted[key]):
             other = "other" if key.endswith("s") else "another"
             raise BadInput(f"{root} was made with {other} {key}: choose another --data or delete it")
+    if dataset.facts["profile"] != profile:  # the TOML has moved
+        dataset.facts["profile"] = profile
+        write_json(facts, dataset.facts)
     return dataset
+
+
+def portable(key: str, value: Any) -> Any:
+    """A fact of a dataset without what differs between folders, and machines that trace other paths."""
+    if key == "profile":
+        return Path(value).name
+    return [note for note in value if TRACED not in note] if key == "notes" else value
 
 
 def check_versions(dataset: Dataset) -> None:

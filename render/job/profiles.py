@@ -42,6 +42,7 @@ class DataProfile:
     models: Path | None = None  # the furniture libraries that training and validation rooms are furnished from
 
 
+FIRST_ROOM = {"train": 0, "val": 1000, "test": 2000}  # the number of a split's first room, for seed 0
 # The frames after a cut, and pairs of later ones: what changes in time needs two.
 JUDGED = (0, 4, 15, 16, 31, 32, 47, 48)
 BENCHMARK_SCENES = ("room-3000", "room-3001", "room-3002", "glass-table", "glass-vitrine")
@@ -150,7 +151,7 @@ def own_profile(path: Path) -> DataProfile:
 
 
 def source_of(profile: DataProfile) -> dict[str, str]:
-    """The TOML of a user's own scene and the files that it is read from, with crc32; else none.
+    """The TOML of a user's own scene and its scene file, as that names it, with crc32 of all that is read; else none.
 
     Raises BadInput where one cannot be read.
     """
@@ -159,7 +160,8 @@ def source_of(profile: DataProfile) -> dict[str, str]:
     scene = own_scene(profile.own)
     try:
         crcs = [crc32_of(file) for file in sorted(set(scene.files))]
-        return {str(profile.own): crc32_of(profile.own), str(scene.file): f"{zlib.crc32(''.join(crcs).encode()):08x}"}
+        content = f"{zlib.crc32(''.join(crcs).encode()):08x}"
+        return {profile.own.name: crc32_of(profile.own), scene.described.file: content}
     except OSError as error:
         raise BadInput(f"{error.filename} cannot be read: {error.strerror}") from None
 
@@ -192,11 +194,13 @@ def named_profile(name: str) -> DataProfile:
         rooms, spp = int(match[1]), int(match[2])
         if rooms < 1 or spp < 2:
             raise BadInput(f"profile '{name}': at least 1 room, and 2 spp or more for the two buffers of a reference")
+        if rooms > FIRST_ROOM["val"]:
+            raise BadInput(f"profile '{name}': at most {FIRST_ROOM['val']} rooms; the next ones are not to train on")
         # Small rooms to train on, and a few to validate and test.
         qualities = [SamplingQuality(8, spp), SamplingQuality(8, reference_spp=64), TEST_OF_SMALL_ROOMS]
         counts = {"train": rooms, "val": 3, "test": 4}
         return DataProfile((12, 96, 96), dict(zip(SPLITS, qualities, strict=True)), rooms=counts)
     if name not in DATA_PROFILES:
-        names = ", ".join(DATA_PROFILES)
+        names = ", ".join([*DATA_PROFILES, "rooms-NxS"])
         raise BadInput(f"unknown profile '{name}'; the profiles are {names}; a scene of your own is a .toml")
     return DATA_PROFILES[name]

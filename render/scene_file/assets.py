@@ -1,6 +1,7 @@
 """What readers of mesh files share: the files that these refer to, images as textures, and checks of meshes."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -8,9 +9,11 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 from trimesh.resolvers import FilePathResolver
+from trimesh.visual import TextureVisuals
 
 from errors import BadInput
-from render.loading import MAX_EXTENT
+from render.loading import BAD_COORDINATES, BAD_NORMALS, MAX_EXTENT, without_direction
+from scenes.animation import Shape
 from scenes.camera import Array
 from scenes.colours import Bsdf, diffuse_bsdf, srgb_to_linear
 
@@ -64,11 +67,44 @@ def texture(values: Array) -> Bsdf:
     return {"type": "bitmap", "data": np.ascontiguousarray(values[::-1], np.float32), "raw": True}
 
 
+def stored_texture(image: Any, raw: bool) -> Bsdf:
+    """The texture of an image as it is, in a tenth of the memory: sRGB, or `raw` values."""
+    if image.mode.startswith("I"):
+        return texture(unit_values(image) if raw else linear_image(image))
+    return {"type": "bitmap", "bitmap": np.ascontiguousarray(np.asarray(image.convert("RGB"))[::-1]), "raw": raw}
+
+
 def two_sided(colour: Bsdf) -> Bsdf:
     return {"type": "twosided", "bsdf": diffuse_bsdf(colour)}
 
 
 def check_mesh(mesh: trimesh.Trimesh, name: str, path: Path) -> None:
-    """Raise BadInput for a mesh without faces, or with vertices that are not finite or too far away."""
+    """Raise BadInput for a mesh without faces, with faces that lack vertices, or vertices too far or not finite."""
     if not len(mesh.faces) or not np.abs(mesh.vertices).max() < MAX_EXTENT:
         raise BadInput(f"{path}: mesh '{name}' is empty or damaged: it has no faces or non-finite vertices")
+    if not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        raise BadInput(f"{path}: mesh '{name}' is damaged: it lacks vertices of its faces; export it again")
+
+
+def computed_normals(mesh: trimesh.Trimesh) -> Array:
+    """Vertex normals (N, 3) by the faces around each vertex; where these cancel out, of one of them."""
+    normals = np.zeros(mesh.vertices.shape)
+    sound = mesh.face_normals.any(axis=1)
+    normals[mesh.faces[sound]] = mesh.face_normals[sound, None]
+    means = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals
+    return np.where(np.linalg.norm(means, axis=1, keepdims=True) > 0.5, means, normals)
+
+
+def mended(shape: Shape, notes: list[str]) -> Shape:
+    """The shape with what of its mesh would make pixels NaN replaced, and a note."""
+    mesh, uv = shape.mesh, getattr(shape.mesh.visual, "uv", None)
+    if shape.smooth and (bad := without_direction(mesh.vertex_normals)).any():
+        computed = computed_normals(mesh)
+        normals = np.where(bad[:, None], computed, mesh.vertex_normals)
+        mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, visual=mesh.visual, process=False)
+        if computed[bad].any():  # else no visible face has these
+            notes.append(f"{shape.name}: {BAD_NORMALS}")
+    if uv is not None and not np.isfinite(uv).all():
+        mesh.visual = TextureVisuals(uv=np.nan_to_num(uv, posinf=0, neginf=0))
+        notes.append(f"{shape.name}: {BAD_COORDINATES}")
+    return replace(shape, mesh=mesh)

@@ -24,6 +24,7 @@ PARTS = {
 }
 WHITE_SKY = {"type": "constant", "radiance": rgb([1.0, 1.0, 1.0])}
 SKIES = ("constant", "envmap", "sunsky")  # a scene has at most one
+UP = "_up"  # of the <lookat> of a sensor: a key of its dictionary that Mitsuba does not get
 OWN_INTEGRATORS = ("path", "direct")  # with the same light transport as here
 
 
@@ -224,7 +225,8 @@ class SceneFile:
             self.note("its film is cropped: the whole view is rendered", node)
         if "near_clip" in described or "far_clip" in described:
             self.note("near_clip and far_clip: nothing is clipped", node)
-        self.sensor = described
+        up = self.parsed.up_of(node)
+        self.sensor = described | {UP: up} if up else described
 
     def add_light(self, index: int) -> None:
         """Add a light that belongs to no shape."""

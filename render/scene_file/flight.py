@@ -9,7 +9,7 @@ from render.backend import dr, mi
 from render.loading import corners, upload
 from render.stage import Stage
 from scenes.animation import Camera, Track
-from scenes.camera import Array, View, cross, directions, intrinsics, look_at, pixel_centres
+from scenes.camera import Array, View, cross, directions, intrinsics, look_at, pixel_centres, unit
 from scenes.draws import Rng, log_uniform
 
 MIN_STEP, MAX_STEP = 0.002, 0.02  # of the distance to the target, per frame
@@ -20,6 +20,7 @@ MAX_HOPS = 4  # to the start of a flight
 TARGET_SHIFT = 0.1  # standard deviation of the target's motion along an axis, of the distance to it
 VIEW_ATTEMPTS = 24  # random directions for the view of a place
 VIEW_GRID = (9, 16)  # rows and columns of rays that sample a view
+STEEPEST = 0.25  # cosine of the steepest pitch at which an image tells which world axis is up
 PROBE_RAYS = 128  # that measure the free space around a point
 
 
@@ -80,13 +81,19 @@ class Start(NamedTuple):
 
 
 def upright(camera: Camera) -> Camera:
-    """The same view with a world axis as up, unless the camera is rolled about its viewing axis."""
+    """The same view with a world axis as up, unless the camera is rolled about its viewing axis.
+
+    Of axes that fit it is y or z, if one of these can be: the image's own up is far from the world's in steep views.
+    """
     eye, target, up = camera.eye.at(0), camera.target.at(0), camera.up.at(0)
+    left = unit(cross(up, target - eye))
+    fit = np.where(np.abs(left) <= 1e-3, unit(up), 0)
+    best = 1 + fit[1:].argmax() if fit[1:].max() > STEEPEST else np.abs(fit).argmax()
+    if abs(fit[best]) <= STEEPEST:
+        return camera
     axis = np.zeros(3)
-    axis[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])
-    left = cross(up, target - eye)
-    rolled = abs(float(left @ axis)) > 1e-3 * np.linalg.norm(left)
-    return camera if rolled else replace(camera, up=Track.constant(axis))
+    axis[best] = np.sign(fit[best])
+    return replace(camera, up=Track.constant(axis))
 
 
 def typical_distance(distances: Array, size: float) -> float:

@@ -14,11 +14,11 @@ from trimesh.transformations import quaternion_matrix
 from trimesh.visual import TextureVisuals
 
 from errors import BadInput
-from render.scene_file.assets import InsideResolver, check_mesh, two_sided
+from render.scene_file.assets import InsideResolver, check_mesh, mended, two_sided
 from render.scene_file.gltf_materials import UNTINTED, Colour, GltfMaterials, coordinate_set
 from render.scene_file.stand_ins import GREY, Names
 from scenes.animation import Camera, Shape, Track
-from scenes.camera import Array
+from scenes.camera import Y_UP, Array, up_of
 from scenes.colours import rgb
 
 COMPONENT_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -225,7 +225,7 @@ class GltfFile:
         elif tint is None:
             self.notes.append(f"{name}: has no material: grey instead")
         # By the specification, a mesh without normals has flat faces.
-        self.shapes.append(Shape(name, mesh, bsdf, emission, smooth=normals is not None))
+        self.shapes.append(mended(Shape(name, mesh, bsdf, emission, smooth=normals is not None), self.notes))
 
     def coordinates(self, attributes: dict[str, int], info: dict[str, Any]) -> Array | None:
         """The texture coordinates (N, 2), with v upwards, that a reference to a texture is for; None for none."""
@@ -253,5 +253,5 @@ class GltfFile:
                 x_fov = np.degrees(2 * np.arctan(aspect * np.tan(camera["perspective"]["yfov"] / 2)))
                 if not np.isfinite([*pose.ravel(), *axes.ravel(), x_fov]).all():
                     raise ValueError("not finite")
-                return Camera.at_rest(pose[:3, 3], pose[:3, 3] - axes[:, 2], float(x_fov), axes[:, 1])
+                return Camera.at_rest(pose[:3, 3], pose[:3, 3] - axes[:, 2], float(x_fov), up_of(axes, Y_UP))
         return None

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from errors import can_draw
-from render.scene_file.assets import linear_image, texture, unit_values
+from render.scene_file.assets import linear_image, stored_texture, texture, unit_values
 from scenes.camera import Array
 from scenes.colours import Bsdf, rgb
 
@@ -110,12 +110,12 @@ class GltfMaterials:
             return None
         return image
 
-    def bitmap(self, info: Json | None, values: Callable[[Any], Array]) -> Bsdf | None:
-        """A texture of the `values` of an image, by a reference to it; None if there is none."""
+    def bitmap(self, info: Json | None, made: Callable[[Any], Bsdf]) -> Bsdf | None:
+        """The texture that is `made` of an image, by a reference to it; None if there is none."""
         image = None if info is None else self.image(info["index"])
         if info is None or image is None:
             return None
-        described = texture(values(image))
+        described = made(image)
         to_uv = placement(info)
         if to_uv is not None:
             described["to_uv"] = to_uv
@@ -146,21 +146,31 @@ class GltfMaterials:
             self.notes.append(f"{name}: several sets of texture coordinates: one of them for all textures instead")
         pbr = metallic_roughness(material)
         factor = np.multiply(pbr.get("baseColorFactor", UNTINTED)[:3], tint).clip(0, 1)
-        colour = self.bitmap(pbr.get("baseColorTexture"), lambda image: linear_image(image) * factor)
+
+        def coloured(image: Any) -> Bsdf:
+            return stored_texture(image, raw=False) if (factor == 1).all() else texture(linear_image(image) * factor)
+
+        colour = self.bitmap(pbr.get("baseColorTexture"), coloured)
         bsdf: Bsdf = {"type": "principled", "base_color": colour or rgb(factor.tolist()), "specular": 0.5}
         for key, channel in (("roughness", 1), ("metallic", 2)):
             number = float(pbr.get(f"{key}Factor", 1.0))
             bsdf[key] = self.channel(pbr.get("metallicRoughnessTexture"), channel, number) or number
         relief = material.get("normalTexture")
-        scale = (1.0, 1.0, 1.0) if relief is None else (relief.get("scale", 1.0),) * 2 + (1.0,)
-        normals = self.bitmap(relief, lambda image: 0.5 + (unit_values(image) - 0.5) * scale)
+        scale = 1.0 if relief is None else relief.get("scale", 1.0)
+
+        def tilted(image: Any) -> Bsdf:
+            if scale == 1:
+                return stored_texture(image, raw=True)
+            return texture(0.5 + (unit_values(image) - 0.5) * (scale, scale, 1.0))
+
+        normals = self.bitmap(relief, tilted)
         if normals is not None:
             bsdf = {"type": "normalmap", "normalmap": normals, "bsdf": bsdf}
         return {"type": "twosided", "bsdf": bsdf}
 
     def channel(self, info: Json | None, number: int, factor: float) -> Bsdf | None:
         """A texture of one channel of an image, times a factor."""
-        return self.bitmap(info, lambda image: unit_values(image)[..., number : number + 1] * factor)
+        return self.bitmap(info, lambda image: texture(unit_values(image)[..., number : number + 1] * factor))
 
     def radiance(self, name: str, index: int, mesh: trimesh.Trimesh, uv: Callable[[Json], Array | None]) -> Array:
         """The mean emission (3,) of a mesh. `uv` are its texture coordinates for a reference to a texture."""

@@ -11,14 +11,14 @@ from errors import BadInput
 from render.backend import mi
 from render.loading import columns, corners, mitsuba_reason
 from render.path import PathTracer
-from render.scene_file.convert import SceneFile
+from render.scene_file.convert import UP, SceneFile
 from render.scene_file.description import camera_of, gain_of, motion_of, read_description
-from render.scene_file.flight import Space, fly
+from render.scene_file.flight import Space, fly, upright
 from render.scene_file.mesh_file import MeshFile
 from render.specular_light import specular_light
 from render.stage import MAX_EVENTS, Stage
 from scenes.animation import Camera, KeyframedTrack, Scene, Shape
-from scenes.camera import Array, look_at, pixel_centres
+from scenes.camera import Array, look_at, pixel_centres, up_of
 
 DEFAULT_DEPTH = 3  # path edges: one indirect bounce
 MAX_DEPTH = 64  # that files get; Russian roulette ends most paths before
@@ -48,7 +48,7 @@ def camera_of_sensor(sensor: dict[str, Any], height: int, width: int) -> tuple[C
         notes.append("the camera mirrors its image: not mirrored instead")
     if any(sensor.get(f"principal_point_offset_{axis}", 0) != 0 for axis in "xy"):
         notes.append("the camera's principal point is off centre: in the centre instead")
-    return Camera.at_rest(eye, eye + axes[:, 2], x_fov, axes[:, 1]), notes
+    return Camera.at_rest(eye, eye + axes[:, 2], x_fov, up_of(axes, np.array(sensor.get(UP, axes[:, 1])))), notes
 
 
 def camera_framing(low: Array, high: Array) -> Camera:
@@ -64,6 +64,7 @@ DEFAULT_CAMERA = camera_framing(np.zeros(3), np.ones(3))  # until the extent of 
 PROBED_PIXELS = 2000
 PROBE_SPP = 32
 PROBED_DEPTHS = (5, 9, 17)
+TRACED = "% of the light"  # in notes that depend on random paths
 
 
 def note_on_depth(stage: Stage, scene: Scene) -> list[str]:
@@ -91,7 +92,7 @@ def note_on_depth(stage: Stage, scene: Scene) -> list[str]:
     enough = next(depth for depth, value in lights.items() if value >= 0.9 * max(lights.values()))
     share = 100 * own / max(lights.values())
     most = PROBED_DEPTHS[-1] - 1
-    few = f"with {scene.max_depth - 1} bounces only {share:.0f} % of the light of {most} bounces arrives"
+    few = f"with {scene.max_depth - 1} bounces only {share:.0f} {TRACED} of {most} bounces arrives"
     return [f"{few}, perhaps because lamps shine through glass: set `bounces = {enough - 1}` in the TOML"]
 
 
@@ -123,6 +124,8 @@ class OwnScene:
             space = Space(self.stage)
             self.scene = replace(self.scene, camera=camera_framing(space.low, space.high))
         self.notes += note_on_depth(self.stage, self.scene)
+        folder = f"{self.file.resolve().parent}/"
+        self.notes = [note.replace(folder, "") for note in self.notes]  # the same wherever the scene is
 
     def from_xml(self) -> tuple[Scene, list[str]]:
         found = SceneFile(self.file)
@@ -164,7 +167,7 @@ class OwnScene:
         """
         chosen = getattr(self.described.splits, split).camera
         if chosen == "keyframes" or (chosen is None and self.described.camera):
-            camera = camera_of(self.described.camera, self.scene.camera, frames)
+            camera = camera_of(self.described.camera, upright(self.scene.camera), frames)
             for frame in range(frames):
                 pose = look_at(camera.eye.at(frame), camera.target.at(frame), camera.up.at(frame))
                 if not np.isfinite(pose).all() or not 0 < camera.x_fov.at(frame) < 180:

@@ -14,7 +14,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import SimpleMaterial
 
 from errors import BadInput, can_draw
-from render.scene_file.assets import InsideResolver, check_mesh, linear_image, texture, two_sided
+from render.scene_file.assets import InsideResolver, check_mesh, mended, stored_texture, two_sided
 from render.scene_file.gltf import GltfFile
 from render.scene_file.stand_ins import GREY, Names
 from scenes.animation import Camera, Shape, Track
@@ -100,7 +100,7 @@ def bsdf_of(mesh: trimesh.Trimesh, name: str, notes: list[str]) -> tuple[Bsdf, A
             if image.info.get("file_path", "").startswith("-"):
                 notes.append(f"{name}: the options of its texture are left out")
             try:
-                colour = texture(linear_image(image))
+                colour = stored_texture(image, raw=False)
             except Exception as error:  # Pillow raises many kinds of exceptions for damaged files
                 notes.append(f"{name}: its texture is damaged ({type(error).__name__}): left out")
         return two_sided(colour), emission if emission.shape == (3,) and emission.any() else None
@@ -191,4 +191,4 @@ class MeshFile:
             if not isinstance(mesh.visual, TextureVisuals):
                 mesh.visual = TextureVisuals()
             emission = None if radiance is None else Track.constant(radiance)
-            self.shapes.append(Shape(name, mesh, bsdf, emission, smooth=True))
+            self.shapes.append(mended(Shape(name, mesh, bsdf, emission, smooth=True), self.notes))

@@ -1,5 +1,6 @@
 """Stand-ins for plugins of other Mitsuba versions, missing files and unsupported content, and notes that name them."""
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from functools import cache
@@ -15,6 +16,7 @@ Properties = dict[str, Any]  # a Mitsuba dictionary
 StandIn = tuple[Properties | None, str]  # None is nothing; and a description of it
 
 GREY = rgb([0.5, 0.5, 0.5])
+GAIN = "_gain"  # of the texture of a bump map: a key in descriptions that Mitsuba does not get
 TEXTURES = ("rgb", "spectrum", "bitmap", "checkerboard", "mesh_attribute", "volume", "uniform", "srgb", "rawconstant")
 RESERVED_NAMES = ("type", "id", "sky")  # keys of a Mitsuba scene's dictionary
 DEFAULT_ALPHA = 0.1  # Mitsuba's roughness of surfaces
@@ -108,8 +110,16 @@ def mixture(described: Properties) -> StandIn:
 
 
 def scaled(described: Properties) -> StandIn:
-    inner = nested(described)
-    return (inner[0], "the texture within, at its own brightness") if inner else (GREY, "grey")
+    """Constant colours are multiplied; other textures keep the factor, for relief."""
+    scale = described.get("scale")
+    factor = scale["value"] if isinstance(scale, dict) and scale["type"] == "rgb" else number_of(described, "scale", 1)
+    inner = [value for name, value in described.items() if isinstance(value, dict) and name != "scale"]
+    if not inner:
+        return GREY, "grey"
+    if inner[0]["type"] == "rgb":
+        return rgb(np.multiply(inner[0]["value"], factor).tolist()), "its colour, scaled"
+    gain = inner[0].get(GAIN, 1) * float(np.mean(factor))
+    return inner[0] | {GAIN: gain}, "the texture within, at its own brightness unless it is relief"
 
 
 def with_properties(words: str, **properties: Any) -> Callable[[Properties], StandIn]:
@@ -165,7 +175,8 @@ def without_relief(described: Properties) -> StandIn | None:
     maps = [value["type"] for value in described.values() if isinstance(value, dict) and value["type"] in TEXTURES]
     fits = "bitmap" in maps if described["type"] == "bumpmap" else maps and "rgb" not in maps
     if fits and bsdfs:
-        return None
+        factor = math.prod(value.get(GAIN, 1.0) for value in described.values() if isinstance(value, dict))
+        return None if factor == 1 else (described | {"scale": number_of(described, "scale", 1) * factor}, "")
     flat = bsdfs[0] if bsdfs else plain_bsdf(described)
     return flat, f"a flat surface without {described['type']}, whose texture is no bitmap"
 

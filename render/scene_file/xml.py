@@ -13,6 +13,7 @@ import numpy as np
 from errors import BadInput
 from render.backend import VARIANT, mi
 from render.loading import mitsuba_reason
+from render.scene_file.stand_ins import numbers
 from scenes.colours import srgb_to_linear
 
 MAX_BYTES = 64 * 2**20  # of XML, all included files together
@@ -244,6 +245,13 @@ class ParsedFile:
     def line_of(self, node: mi.parser.SceneNode) -> str:
         """Where a node is described: " (line 12)"; nothing for one of a file that Mitsuba includes."""
         return "" if node.file_index else f" ({self.element(node.offset + 1).place.rpartition('/')[2]})"
+
+    def up_of(self, node: mi.parser.SceneNode) -> list[float] | None:
+        """The `up` of the <lookat> that a sensor's transform ends with; None where there is none that can be read."""
+        steps = [] if node.file_index else self.element(node.offset + 1).findall("transform/*")
+        last = steps[-1] if steps else None
+        up = numbers(last.get("up")) if last is not None and last.tag == "lookat" else []
+        return up if len(up) == 3 else None
 
     def reason(self, error: Exception) -> str:
         """An error's message with the place and tag of the element that it is about."""

@@ -13,6 +13,7 @@ from denoise.foreign_frame import open_passes, read_foreign_frame
 from denoise.frames import FrameBuilder, camera_conventions
 from denoise.sequence import sequence_of
 from denoise.sources import find_sources
+from scenes.camera import STILL, View, intrinsics, look_at, pixel_centres, unproject
 from tests.denoise.conftest import READS
 from tests.helpers import foreign
 
@@ -20,7 +21,7 @@ from tests.helpers import foreign
 def frames_of(folder: Path) -> list[Frame]:
     files = sequence_of({"colour": [str(folder / "*.exr")]})
     sources = find_sources(open_passes(files[0], header_only=True), {})
-    builder = FrameBuilder(analyse([files], sources, READS, None, "exact").conventions, READS, "test")
+    builder = FrameBuilder(analyse([files], sources, READS, None).conventions, READS, "test")
     return [builder.build(read_foreign_frame(each, sources)[0]) for each in files]
 
 
@@ -113,6 +114,42 @@ def test_positions_are_preferred_to_the_headers_camera(box, tmp_path):
     files = sequence_of({"colour": [str(tmp_path / "1.exr")]})
     pixels, _ = read_foreign_frame(files[0], find_sources(open_passes(files[0]), {}))
     assert camera_conventions(pixels).cameras == "positions"
+
+
+@pytest.mark.parametrize(("named", "layer"), [({}, "rl.beauty"), ({"colour": "rl.albedo"}, "rl.albedo")])
+def test_the_other_sample_buffer_has_the_layer_of_the_colour(tmp_path, named, layer):
+    layers = {"rl.albedo.RGB": np.ones((4, 4, 3)), "rl.beauty.RGB": np.zeros((4, 4, 3))}
+    paths = {name: [str(foreign.write(tmp_path / name / "1.exr", layers))] for name in ("colour", "buffer_b")}
+    sources = find_sources(open_passes(sequence_of(paths)[0], header_only=True), named)
+    assert sources.quantities["colour"].layer.name == sources.quantities["buffer_b"].layer.name == layer
+
+
+@pytest.mark.parametrize("first", ["at the origin", "before a wall"])
+def test_positions_in_the_world_of_any_first_frame(tmp_path, first):
+    size = 24, 32
+    depth = np.random.default_rng(0).uniform(2, 9, size)
+    for index in range(3):
+        eye = np.array([0.3 * index, 0, 0]) + (first == "before a wall")
+        camera = View(intrinsics(60.0, *size), look_at(eye, eye - [0.0, 0.0, 1.0]), STILL)
+        is_flat = index == 0 and first == "before a wall"
+        points = unproject(pixel_centres(*size), np.full(size, 5.0) if is_flat else depth, camera)
+        foreign.write(tmp_path / f"{index}.exr", {"RGB": np.ones((*size, 3)), "P.XYZ": points})
+    *_, before, last = frames_of(tmp_path)
+    torch.testing.assert_close(last.now.camera_to_world[0], torch.from_numpy(camera.camera_to_world), rtol=0, atol=1e-3)
+    assert last.follows(before.moment)
+
+
+def test_frames_without_a_camera_have_no_history(tmp_path):
+    """Walls alone, and no motion: nothing says that they are at rest."""
+    size = 24, 32
+    depth = np.random.default_rng(0).uniform(2, 9, size)
+    for index in range(4):
+        eye = np.array([5.0 + index, 0, 0])
+        camera = View(intrinsics(60.0, *size), look_at(eye, eye - [0.0, 0.0, 1.0]), STILL)
+        points = unproject(pixel_centres(*size), depth if index < 2 else np.full(size, 5.0), camera)
+        foreign.write(tmp_path / f"{index}.exr", {"RGB": np.ones((*size, 3)), "P.XYZ": points})
+    follows = [now.follows(before.moment) for before, now in pairwise(frames_of(tmp_path))]
+    assert follows == [True, False, False]
 
 
 def test_a_camera_without_depth_gives_no_motion(box, tmp_path):

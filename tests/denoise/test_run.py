@@ -24,7 +24,8 @@ from denoise.exr_image import ExrImage
 from denoise.frame_errors import ErrorTable
 from denoise.job import Job
 from denoise.parts import Parts
-from denoise.run import denoise
+from denoise.run import SequenceDenoiser, denoise
+from denoise.sequence import FrameFiles
 from errors import BadInput
 from eval.tradeoff.samples import with_samples
 from models.registry import create
@@ -127,7 +128,7 @@ def test_the_sky_stays_as_it_is_and_only_the_image_changes(spheres, tmp_path):
     for path, frame in zip(before, spheres, strict=True):
         old, new = foreign.read(path), foreign.read(tmp_path / "out" / path.name)
         header = foreign.header(tmp_path / "out" / path.name)
-        assert old.keys() == new.keys() and header["owner"] == "me" and header["denoised"] == "onespp svgf"
+        assert old.keys() == new.keys() and header["owner"] == "me" and header["denoised"].startswith("onespp svgf ")
         np.testing.assert_array_equal(header["worldToCamera"], np.eye(4))
         assert all(new[name].dtype == np.float16 for name in new)
         replaced = {f"ViewLayer.Combined.{c}" for c in "RGB"}
@@ -291,6 +292,48 @@ def test_a_frame_rendered_again_is_denoised_again_with_all_that_depend_on_it(sph
     assert "2 of them new" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("ends_by", ["interruption", "--frames"])
+def test_history_of_a_frame_rendered_again_stays_in_no_later_frame(spheres, tmp_path, monkeypatch, ends_by):
+    """Where a run ended before them, and where the new file is older than what was denoised."""
+    paths = foreign.write_sequence(tmp_path / "in", spheres, foreign.blender)
+    denoised(tmp_path / "in", tmp_path / "out")
+    layers = foreign.blender(spheres[1])
+    layers["ViewLayer.Noisy Image.RGBA"] *= 2
+    foreign.write(paths[1], layers)
+    os.utime(paths[1], (0, 0))
+    whole = denoised(tmp_path / "in", tmp_path / "whole")
+    if ends_by == "--frames":
+        denoised(tmp_path / "in", tmp_path / "out", frame_range="1-3")
+    else:
+        write, written = SequenceDenoiser.write, []
+
+        def write_two(self: SequenceDenoiser, files: FrameFiles, *rest: object) -> None:
+            if len(written) == 2:
+                raise KeyboardInterrupt
+            written.append(files)
+            write(self, files, *rest)
+
+        monkeypatch.setattr(SequenceDenoiser, "write", write_two)
+        with pytest.raises(KeyboardInterrupt):
+            denoised(tmp_path / "in", tmp_path / "out")
+        monkeypatch.undo()
+    assert same(denoised(tmp_path / "in", tmp_path / "out"), whole)
+
+
+def test_previews_are_of_the_image(spheres, tmp_path):
+    """Not of the one before the frame was rendered again, and denoised without previews."""
+    paths = foreign.write_sequence(tmp_path / "in", spheres[:1], foreign.blender)
+    denoised(tmp_path / "in", tmp_path / "out", png=True)
+    preview = (tmp_path / "out" / "0001.png").read_bytes()
+    layers = foreign.blender(spheres[0])
+    layers["ViewLayer.Noisy Image.RGBA"][:20] *= 2
+    foreign.write(paths[0], layers)
+    os.utime(paths[0], (0, 0))
+    denoised(tmp_path / "in", tmp_path / "out")
+    denoised(tmp_path / "in", tmp_path / "out", png=True)
+    assert (tmp_path / "out" / "0001.png").read_bytes() != preview
+
+
 def test_settings_are_never_mixed(spheres, tmp_path):
     foreign.write_sequence(tmp_path / "in", spheres, foreign.blender)
     with pytest.raises(BadInput, match="not a number of samples"):
@@ -398,6 +441,52 @@ def test_what_cannot_be_done_is_explained(spheres, tmp_path, capfd):
     foreign.write(paths[1], {"ViewLayer.Noisy Image.RGBA": np.ones((40, 56, 4))})
     with pytest.raises(BadInput, match=r"0002\.exr has no channel"):
         denoised(tmp_path / "in", tmp_path / "other", motion="XY,+x,-y,pixels")
+
+
+def test_a_data_window_that_moves_is_refused(tmp_path):
+    for left in (0, 1):
+        window = {"dataWindow": (np.array([left, 0], np.int32), np.array([left + 3, 3], np.int32))}
+        foreign.write(tmp_path / "in" / f"{left}.exr", {"RGB": np.ones((4, 4, 3))}, window)
+    with pytest.raises(BadInput, match=r"1\.exr begins at \(1, 0\) .* render all frames with the same data window"):
+        denoised(tmp_path / "in", tmp_path / "out")
+
+
+def test_deep_images_are_refused(tmp_path):
+    deep = np.empty((2, 3), object)
+    for place in np.ndindex(deep.shape):
+        deep[place] = np.ones(2, np.float32)
+    header = {"type": OpenEXR.deepscanline, "compression": OpenEXR.ZIPS_COMPRESSION}
+    OpenEXR.File(header, {c: deep for c in "RGB"}).write(str(tmp_path / "1.exr"))
+    with pytest.raises(BadInput, match=r"1\.exr: the channel 'R' is deep: flatten the image"):
+        denoised(tmp_path, tmp_path / "out")
+
+
+def test_negative_depth_is_not_taken_for_background(tmp_path):
+    depth = np.full((4, 4, 1), -5.0)
+    depth[0] = 1e10
+    foreign.write(tmp_path / "1.exr", {"RGB": np.ones((4, 4, 3)), "Z": depth})
+    with pytest.raises(BadInput, match=r"1\.exr: the depth is negative: change its sign"):
+        denoised(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("option", "of_ours", "message"),
+    [
+        ({"motion": "XY,-x,+y,pixels"}, False, "--motion XY,-x,.y,pixels: there is no motion layer"),
+        ({"albedo": "sampled"}, False, "--albedo sampled: there is no albedo layer"),
+        ({"motion": "garbage"}, True, "--motion is for other renderers"),
+        ({"albedo": "exact"}, True, "--albedo is for other renderers"),
+        ({"spp": 4.0}, True, "--spp is for other renderers"),
+    ],
+)
+def test_options_that_do_not_apply_are_refused(tiny, tmp_path, option, of_ours, message):
+    if of_ours:
+        export_clip(Dataset(tiny).clips("test")[0].path, tmp_path / "in")
+    else:
+        foreign.write(tmp_path / "in" / "1.exr", {"RGB": np.ones((4, 4, 3))})
+    with pytest.raises(BadInput, match=message):
+        denoised(tmp_path / "in", tmp_path / "out", **option)
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_command_takes_patterns_files_and_oidns_flags(spheres, tmp_path, capsys):

@@ -33,6 +33,19 @@ def test_the_number_that_differs_is_the_frame(folder):
     assert [frame.number for frame in sequence_of({"colour": ["*.exr"]})] == [1, 2]
 
 
+@pytest.mark.parametrize("form", ["f.{:05d}.exr", "f_{}.exr", "{:03d}.exr"])
+def test_frames_before_zero(folder, form):
+    folder(*map(form.format, (-2, -1, 0, 1)))
+    assert [frame.number for frame in sequence_of({"colour": ["*.exr"]})] == [-2, -1, 0, 1]
+    for numbers, expected in (("-2--1", [-2, -1]), ("-1-0", [-1, 0]), ("-2", [-2]), ("0-1", [0, 1])):
+        assert [frame.number for frame in sequence_of({"colour": ["*.exr"]}, numbers)] == expected
+
+
+def test_a_dash_between_words_is_no_minus(folder):
+    folder("shot-01-2.exr", "shot-01-3.exr")
+    assert [frame.number for frame in sequence_of({"colour": ["*.exr"]})] == [2, 3]
+
+
 def test_one_file_needs_no_number(folder):
     folder("still.exr", "a.exr", "b.exr")
     assert len(sequence_of({"colour": ["still.exr"]})) == 1

@@ -10,6 +10,7 @@ from PIL import Image
 
 from eval.harness import evaluate
 from eval.report.page import report
+from provenance import device_in_words
 from tests.helpers.shared import made_once
 from tests.helpers.training import folder_of, fresh_weights
 from train.task import WEIGHTS_FILE
@@ -33,7 +34,8 @@ def bench_of(runs: Path, times: dict[str, float], size: tuple[int, int], threads
         for n in threads
     ]
     (runs / "bench").mkdir(parents=True)
-    results = {"schema": 1, "device": "cpu", "threads": max(threads), "rows": rows}
+    most = max(threads)
+    results = {"schema": 1, "device": device_in_words("cpu", most), "threads": most, "rows": rows}
     (runs / "bench" / "results.json").write_text(json.dumps(results))
 
 

@@ -26,6 +26,7 @@ from eval.bench.denoisers import (
     thread_counts,
     time_in_turns,
     timed_specs,
+    timed_with,
 )
 from eval.bench.memory import alone
 from eval.bench.synthetic_frames import synthetic_frame
@@ -49,6 +50,7 @@ def test_results_have_the_agreed_form(tmp_path):
     results = json.loads(path.read_text())
     assert path.name == "results.json"
     assert (results["schema"], results["device"], results["threads"]) == (1, device_in_words(threads=1), 1)
+    assert results["made_by"] == timed_with()
     rows = results["rows"]
     assert all([*row] == FIELDS.split() and (row["width"], row["height"]) == (64, 32) for row in rows)
     usual = fastest_precision("rae")

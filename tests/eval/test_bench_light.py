@@ -7,6 +7,7 @@ from eval.bench import light
 from eval.bench.light import AFTER, BEFORE, CHANGE, STEADY, bench_light, changed
 from files import read_json
 from render.clip import Sampling
+from tests.eval.conftest import untrained
 
 
 def lamp(change: str, frame: int) -> np.ndarray:
@@ -29,7 +30,9 @@ def test_only_a_denoiser_with_history_lags(tmp_path, monkeypatch):
     monkeypatch.setattr(light, "BEFORE", changes)
     monkeypatch.setattr(light, "LIGHT_CLIP_SIZE", (light.LIGHT_CLIP_SIZE[0], 24, 32))
     monkeypatch.setattr(light, "LIGHT_CLIP_SAMPLING", Sampling(realisations=1, noisy_spp=1, reference_spp=8))
-    table = bench_light(tmp_path, ("noisy", "accumulated"), "quick")
+    untrained(tmp_path, "ntd")
+    table = bench_light(tmp_path, ("noisy", "accumulated", "ntd@tiny"), "quick")
+    assert "| ntd@tiny (indirect) |" in table
     assert "loss 8 frames after" in table and (tmp_path / "bench" / "light" / "plot.png").exists()
     rows = {row["denoiser"]: row["psnr"] for row in read_json(tmp_path / "bench" / "light" / "results.json")["rows"]}
     for change in changes:

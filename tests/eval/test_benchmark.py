@@ -21,6 +21,7 @@ from provenance import ROOT
 from render.job.profiles import BENCHMARK_SCENES, JUDGED
 from render.scene_file.description import read_description
 from scenes.camera import STILL, View, intrinsics, look_at
+from tests.eval.conftest import untrained
 from tests.helpers.scene_files import xml
 
 NAMES = ("noisy", "svgf", "one")
@@ -65,7 +66,7 @@ def test_digests_tell_our_scene_files_from_others(tmp_path, monkeypatch):
     monkeypatch.setattr("eval.benchmark.run.entries", lambda: described)
     there = {line.split()[0]: line for line in list_scenes(tmp_path).splitlines()[2:16]}
     assert there["kitchen"].endswith(" yes") and there["bathroom"].endswith(" missing")
-    assert there["veach-ajar"].endswith("the file of our results")
+    assert there["veach-ajar"].endswith("the scene.xml of our results")
     assert there["glass-of-water"].endswith(f"another file than that of our results ({crc32})")
 
 
@@ -135,6 +136,9 @@ def test_the_page_has_both_videos_of_every_clip(benchmark):
     assert page.count("data:image/webp;base64,") == 2 * 6 and "kitchen/000" in page
     with pytest.raises(BadInput, match="noisy is named twice"):
         write_page(("noisy", "noisy"), [root / "data" / "kitchen"], root / "runs", "quick")
+    untrained(root / "runs", "ntd")
+    with pytest.raises(BadInput, match="noisy total and ntd@tiny indirect light are different images"):
+        write_page(("noisy", "ntd@tiny"), [root / "data" / "kitchen"], root / "runs", "quick")
 
 
 SIZE = 24, 32

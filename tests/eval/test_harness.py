@@ -19,7 +19,7 @@ from eval.harness import do_all, evaluate, sheet
 from eval.metrics import METRICS
 from eval.results import FLOOR, ClipResults, Result, folder_of, heading, load_picture, read_results
 from eval.tables import means_by_age
-from files import read_json, write_json
+from files import locked, read_json, write_json
 from tests.eval.conftest import untrained
 
 KEYS = {
@@ -195,6 +195,11 @@ def test_finished_results_are_kept(once, runs, tiny, played):
     before = content(once)
     evaluate([tiny], runs, "tiny", NAMES)
     assert played == [] and content(runs) == before
+
+
+def test_a_second_evaluation_at_once_is_refused(runs, tiny):
+    with locked(runs / "eval" / ".lock"), pytest.raises(BadInput, match=r"another process is writing .*eval: wait"):
+        evaluate([tiny], runs, "tiny", NAMES)
 
 
 def test_only_changed_denoisers_are_evaluated_again(runs, tiny, played):

@@ -21,13 +21,15 @@ from errors import BadInput
 from eval.clip_run import densest_crop
 from eval.harness import evaluate_clip, named_denoisers
 from eval.metrics import METRICS, flip_map
-from eval.report.page import page_clip, report
+from eval.report.page import page_clip, render, report
 from eval.results import FLOOR, MAX_SHOWN_ERROR, by_clip, folder_of, load_picture, load_result
 from eval.tables import TableRow, best_denoisers
 from eval.tradeoff.samples import with_samples
+from files import read_json, write_json
 from models.spec import DenoiserSpec
 from models.wrappers.error_estimate import denoise_with_error
 from provenance import ROOT
+from tests.eval.conftest import bench_of
 
 
 class Page(HTMLParser):
@@ -269,6 +271,14 @@ def test_without_a_bench_there_is_no_plot(evaluated, tmp_path):
     report(runs, megabytes=1e-6)  # one frame a clip
     assert Page(runs / "report" / "index.html").data["trades"] == []
     assert 'id="trade"' not in (runs / "report" / "index.html").read_text()
+
+
+def test_times_of_other_code_are_named(tmp_path, capsys):
+    bench_of(tmp_path, {"noisy": 1.0}, (32, 48))
+    path = tmp_path / "bench" / "results.json"
+    write_json(path, read_json(path) | {"made_by": {}})
+    render({"dataset": "data", "device": "cpu", "versions": {}}, [], tmp_path, 1.0, live=False)
+    assert f"{path} has times of other code or packages: measure again with" in capsys.readouterr().out
 
 
 def test_a_live_page_that_fails_without_a_word_costs_nothing_else(evaluated, tmp_path, monkeypatch, capsys):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from command_line import main
 from errors import BadInput
@@ -165,6 +166,13 @@ def test_specialised_weights_have_no_mean(tmp_path):
     with pytest.raises(BadInput, match=r"a.safetensors is specialised to one scene"):
         average_weights(create("wskp3"), "wskp3", [file], tmp_path / "mean.safetensors")
     assert not (tmp_path / "mean.safetensors").exists()
+
+
+def test_weights_that_do_not_state_their_training_have_no_mean(tmp_path):
+    file = tmp_path / "a.safetensors"
+    save_file(create("wskp3").state_dict(), file, {"denoiser": "wskp3"})
+    with pytest.raises(BadInput, match=r"a.safetensors does not state how it was trained"):
+        average_weights(create("wskp3"), "wskp3", [file], tmp_path / "mean.safetensors")
 
 
 def test_results_of_other_weights_are_refused(wskp3, tiny, tmp_path):

@@ -2,12 +2,14 @@
 
 import math
 import re
+from pathlib import Path
 
 import pytest
 
 from errors import BadInput
+from eval import pages
 from eval.pages import EXTRACTS, GENERATORS, measured, noise_off
-from eval.results import FLOOR, NOISE_FLOOR, read_results
+from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, read_results
 from eval.tables import TableRow, results_table, table_by_age
 from eval.tradeoff.trades import Trade, front_table, samples_table
 from files import write_json
@@ -61,6 +63,24 @@ def test_noise_of_references_is_taken_off():
     ]
     assert noise_off(clips, "one") == "25.00"
     assert noise_off(clips, NOISE_FLOOR) == ""
+
+
+def test_what_has_no_time_is_named_below_the_front(monkeypatch):
+    rows = [row | ({"ms": None} if row["denoiser"] == "one" else {}) for row in measured("trade")["samples"]]
+    monkeypatch.setattr(pages, "measured", lambda _: {"samples": rows})
+    above, _, below = pages.front().partition("\nWithout a time: ")
+    assert "`one`" in below and "`one`" not in above
+
+
+def test_standard_errors_fall_with_the_frames(monkeypatch):
+    """The mean of frames with 3 and 4 has one of 2.5; other floors are averaged."""
+    place = {"key": "", "signal": "total", "scene": "box", "clip": "000", "metrics": {}}
+    frames = [{"energy": error, "psnr": error} for error in (9.0, 3.0, 4.0)]
+    floor = Result(denoiser=NOISE_FLOOR, frames=frames, **place)
+    monkeypatch.setattr(pages, "read_results", lambda _: ({}, [ClipResults("box", "000", "total", [], floor)]))
+    (clip,) = pages.steady_clips(Path(), 1)
+    floors = clip["results"][NOISE_FLOOR]
+    assert (floors["energy"], floors["psnr"]) == (2.5, 3.5)
 
 
 def test_however_small_the_error_of_energy_has_two_digits():

@@ -12,16 +12,26 @@ import eval.tradeoff.run
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
+from eval.bench.denoisers import timed_with
 from eval.harness import clips_of_one_spp
 from eval.metrics import METRICS
 from eval.report.page import trade_plots
 from eval.results import NOISE_FLOOR, ClipResults, Result
 from eval.tables import ClipScores
-from eval.tradeoff.run import candidates, check_levels, draw_samples, tables, trade, with_more_samples
+from eval.tradeoff.run import (
+    candidates,
+    check_levels,
+    draw_samples,
+    results_by_spp,
+    tables,
+    trade,
+    with_more_samples,
+)
 from eval.tradeoff.samples import fit_cost, rendered, sample_cost, scene_of, with_samples
 from eval.tradeoff.trades import Times, Trade, dominated_by_name, trades
-from files import read_json, write_json
+from files import locked, read_json, write_json
 from models.spec import DenoiserSpec
+from provenance import device_in_words
 from render.clip import NO_OPTIONS
 from tests.eval.conftest import bench_of, untrained
 
@@ -207,6 +217,25 @@ def test_the_remedy_for_missing_times_measures_all_in_one_run(tmp_path):
     assert f"Without a time: svgf+js. Measure all with `{command}`." in tables(rows, rows, "title", times)
 
 
+def test_times_of_another_device_are_refused(tiny, tmp_path):
+    bench_of(tmp_path, {"noisy": 1.0}, SIZE)
+    Times(tmp_path, SIZE).check_device()
+    path = tmp_path / "bench" / "results.json"
+    write_json(path, read_json(path) | {"device": "cpu, another, 2 threads"})
+    with pytest.raises(BadInput, match=r"results.json has times of cpu, another.*`onespp bench denoisers noisy --size"):
+        trade(tiny, tmp_path, "tiny", (1,), ("noisy",), "48x32")
+
+
+def test_times_of_other_code_are_named(tmp_path):
+    bench_of(tmp_path, {"noisy": 1.0}, SIZE)
+    assert Times(tmp_path, SIZE).warnings == []  # unknown
+    path = tmp_path / "bench" / "results.json"
+    for code in (timed_with()["code"], "other"):
+        write_json(path, read_json(path) | {"made_by": timed_with() | {"code": code}})
+        printed = tables([], [], "title", Times(tmp_path, SIZE))
+        assert ("times of other code or packages: measure again with `onespp bench" in printed) == (code == "other")
+
+
 def test_networks_are_fed_in_the_precision_that_is_timed(monkeypatch):
     monkeypatch.setattr(eval.tradeoff.run, "RENDERER", "cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -233,7 +262,7 @@ def traded(tiny, tmp_path_factory):
 def test_trade_has_every_precision(traded):
     content, text, figures = traded
     assert (content["size"], content["threads"], len(content["clips"])) == ("48x32", 2, 2)
-    assert content["device"] == "cpu"  # that of the times
+    assert content["device"] == device_in_words(threads=2)  # that of the times
     rows = {row["label"]: row for row in content["rows"]}
     assert {"noisy", "wskp6@tiny", "wskp6@tiny-bfloat16", "wskp6@tiny-float16"} <= rows.keys()
     assert rows["wskp6@tiny"]["ms"] == rows["wskp6@tiny-float16"]["ms"] == 2.0
@@ -269,6 +298,11 @@ def test_the_plot_of_samples(traded):
         ours = [row for row in rows if row.label == label]
         assert by_spp.get_xydata().tolist() == [[row.spp, row.metrics["psnr"]] for row in ours]
         assert by_ms.get_xydata().tolist() == [[row.ms, row.metrics["psnr"]] for row in ours]
+
+
+def test_a_second_trade_at_once_is_refused(tiny, tmp_path):
+    with locked(tmp_path / ".lock"), pytest.raises(BadInput, match="another process is writing"):
+        results_by_spp([], [], Dataset(tiny), (1,), tmp_path)
 
 
 def test_clips_of_more_samples_are_left_out(tiny, tmp_path):

@@ -133,4 +133,6 @@ def main(source: str, out: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit("python -m tests.helpers.foreign CLIP|WxH OUT: a test clip's folder, or the size of made-up frames")
     main(sys.argv[1], Path(sys.argv[2]))

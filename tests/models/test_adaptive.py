@@ -186,5 +186,5 @@ def test_every_accumulating_denoiser_has_the_wrapper():
         inner, after = registry.prototype(name), registry.prototype(f"{name}+accumulated")
         assert (after.convex, after.separates_lights) == (inner.convex, inner.separates_lights)
     for name in ("noisy+adaptive", "svgf+adaptive", "eaw+taa+adaptive"):
-        with pytest.raises(BadInput, match="does not accumulate"):
+        with pytest.raises(BadInput, match=r"which \+adaptive replaces"):
             registry.prototype(name)

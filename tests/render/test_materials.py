@@ -6,7 +6,7 @@ import trimesh
 
 from render.backend import dr, mi
 from render.loading import to_mitsuba
-from render.materials import mean_of
+from render.materials import material_of, mean_of
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, StockShape, Track
 from tests.helpers.rendering import first_gbuffer, rgb
@@ -133,7 +133,10 @@ def textured_square(bsdf: dict) -> Scene:
     return Scene((Shape("square", mesh, bsdf),), camera)
 
 
-@pytest.mark.parametrize("bsdf", [{"type": "plastic"}, {"type": "roughplastic", "alpha": 0.05}])
+@pytest.mark.parametrize(
+    "bsdf",
+    [{"type": "plastic"}, {"type": "roughplastic", "alpha": 0.05}, {"type": "plastic", "specular_reflectance": 0.3}],
+)
 @pytest.mark.parametrize("eta", [1.3, 1.9])
 def test_albedo_of_plastics_is_diffuse_plus_specular(bsdf, eta):
     bsdf = {**bsdf, "int_ior": eta, "ext_ior": 1.0, "diffuse_reflectance": rgb(0.1, 0.4, 0.7)}
@@ -163,6 +166,12 @@ def test_textures_are_read_where_they_are_seen():
     buffer = first_gbuffer(textured_square(bsdf), 4, 4)
     np.testing.assert_allclose(buffer["roughness"], ramp[::-1], rtol=1e-5)
     np.testing.assert_allclose(buffer["albedo"], colour[::-1], rtol=1e-5)
+
+
+def test_anisotropic_roughness_is_the_mean_of_its_textures():
+    halves = {"type": "bitmap", "data": np.float32([0.1, 0.3, 0.3, 0.1]).reshape(1, 4, 1), "raw": True}
+    bsdf = mi.load_dict(to_mitsuba({"type": "roughconductor", "alpha_u": halves, "alpha_v": 0.2}))
+    assert mean_of(material_of(bsdf).roughness) == pytest.approx(0.2, rel=1e-5)
 
 
 def test_every_shape_has_its_own_material():

@@ -1,6 +1,7 @@
 """The parts of the extension for Blender that need no Blender: OpenEXR files, passes, and the supersampled albedo."""
 
 import importlib
+import os
 import sys
 import types
 from pathlib import Path
@@ -206,11 +207,40 @@ def test_surfaces_that_come_into_view_begin_with_their_own_albedo(extension):
     assert (mean.frames[20:] == 2).all() and np.isfinite(mean.mean).all()
 
 
+def still_camera(extension):
+    return extension("camera").Camera("", np.array([[-1, 0, 0.5], [0, -1, 0.5], [0, 0, 1]]), np.eye(4))
+
+
+def test_a_frame_rendered_again_has_those_after_it_denoised_again(extension, unpacked, tmp_path, monkeypatch):
+    """Also in a run after one that was interrupted, and where the new file is older than the denoised one."""
+    monkeypatch.syspath_prepend(unpacked)
+    camera = still_camera(extension)
+
+    def path_of(number: int) -> Path:
+        return tmp_path / f"{number}.exr"
+
+    def run(most: int = 9) -> list[int]:
+        animation = extension("animation").Animation(path_of, tmp_path / "denoised", detects_cuts=False)
+        done = []
+        for number in range(1, 6):
+            if len(done) < most and not animation.is_finished(number):
+                animation.denoise(number, camera)
+                done.append(number)
+        return done
+
+    for number in range(1, 6):
+        write(path_of(number), [layers(np.random.default_rng(number))])
+    assert run() == [1, 2, 3, 4, 5] and run() == []
+    write(path_of(2), [layers(np.random.default_rng(9))])
+    os.utime(path_of(2), (0, 0))
+    assert run(most=2) == [2, 3] and run() == [4, 5] and run() == []
+
+
 def test_files_of_others_are_not_replaced(extension, unpacked, tmp_path, monkeypatch):
     """As are its own, damaged ones too."""
     monkeypatch.syspath_prepend(unpacked)
     rendered = write(tmp_path / "0001.exr", [layers(np.random.default_rng(8))])
-    camera = extension("camera").Camera("", np.array([[-1, 0, 0.5], [0, -1, 0.5], [0, 0, 1]]), np.eye(4))
+    camera = still_camera(extension)
     animation = extension("animation").Animation(lambda _: rendered, tmp_path / "denoised")
     target = animation.denoised(1)
     animation.denoise(1, camera)

@@ -107,6 +107,8 @@ def test_weights_that_cannot_be_begun_with_are_named(capsys, tiny, tmp_path, gen
     there = ["--data", str(tiny), "--runs", str(tmp_path / "runs"), "--budget", "tiny"]
     assert "there are no weights at missing" in fails(capsys, "train", "wskp3", "--from", "missing", *there)
     assert "holds weights of 'wskp3', not of 'rae'" in fails(capsys, "train", "rae", "--from", str(general), *there)
+    folder = str(general.parent)
+    assert f"{folder} is a folder: name the file" in fails(capsys, "train", "wskp3", "--from", folder, *there)
     assert not list(tmp_path.glob("runs/train/*/[!.]*"))
 
 

@@ -1,5 +1,6 @@
 """An animation on disk: rendered frames in one folder, denoised ones in another, and which of these are finished."""
 
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from .history import Begin, History
 
 REPLAYED = 32  # frames at most, to restore a history: older ones weigh little
 NOTE = "onespp"  # the attribute that says how a denoised frame was made
-VERSION = 1  # of the note: frames with another are denoised again
+VERSION = 2  # of the note: frames with another are denoised again
 
 
 @dataclass
@@ -41,16 +42,22 @@ class Animation:
 
     def note(self, number: int) -> dict[str, Any] | None:
         """How a finished frame was denoised; None where it has to be, as after it was rendered again."""
-        rendered, denoised = self.path_of(number), self.denoised(number)
+        denoised = self.denoised(number)
         if not denoised.exists():
-            return None
-        if rendered.exists() and rendered.stat().st_mtime_ns > denoised.stat().st_mtime_ns:
             return None
         try:
             note = json.loads(ExrReader(denoised).attribute(NOTE) or "{}")
         except (BadFrame, json.JSONDecodeError):
             return None
-        return note if (note.get("version"), note.get("detects_cuts")) == (VERSION, self.detects_cuts) else None
+        if (note.get("version"), note.get("detects_cuts")) != (VERSION, self.detects_cuts):
+            return None
+        is_same = not self.path_of(number).exists() or note["rendered"] == self.stamp(number)
+        return note if is_same else None
+
+    def stamp(self, number: int) -> list[int]:
+        """Of a rendered frame: another one once it is rendered again."""
+        stat = self.path_of(number).stat()
+        return [stat.st_size, stat.st_mtime_ns]
 
     def is_finished(self, number: int) -> bool:
         """Whether nothing has changed that the denoised frame depends on, with the frame before finished, too."""
@@ -59,7 +66,14 @@ class Animation:
             return False
         if note["begin"] == Begin.GAP and self.is_rendered(number - 1):  # that was not there
             return False
+        if note["begin"] == Begin.CONTINUED and self.digest(number - 1) not in (note["before"], None):
+            return False
         return self.history.number != number - 1 or note["begin"] in (Begin.CAMERA, Begin.CUT)
+
+    def digest(self, number: int) -> str | None:
+        """Of a finished frame's note, and so of all notes before it; None where there is no such frame."""
+        note = self.note(number)
+        return hashlib.sha256(json.dumps(note).encode()).hexdigest()[:16] if note else None
 
     def denoise(self, number: int, camera: Camera) -> Begin:
         """Denoise and write a rendered frame. Raises BadFrame where it cannot be, and OSError of the disk."""
@@ -68,6 +82,7 @@ class Animation:
             raise BadFrame(f"{target} was not written by this extension: move it away or choose another folder")
         if self.history.number != number - 1:
             self.replay(number)
+        stamp = self.stamp(number)
         frame = read_cycles_frame(self.path_of(number))
         radiance, begin = self.history.denoise(number, frame, camera)
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -75,6 +90,8 @@ class Animation:
             "version": VERSION,
             "detects_cuts": self.detects_cuts,
             "begin": begin,
+            "rendered": stamp,
+            "before": self.digest(number - 1) if begin == Begin.CONTINUED else None,
             "camera": camera.name,
             "K": camera.K.tolist(),
             "camera_to_world": camera.camera_to_world.tolist(),

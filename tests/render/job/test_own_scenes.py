@@ -12,10 +12,11 @@ from datasets.channels import USUAL_CHANNELS
 from datasets.clip import Dataset
 from errors import BadInput
 from eval.tradeoff.samples import scene_of
+from models.registry import channels_read
 from render.clip import NO_OPTIONS
-from render.job.generate import begun
+from render.job.generate import begun, portable
 from render.job.profiles import SamplingQuality, own_profile, profile_of, source_of
-from render.scene_file.load import own_scene
+from render.scene_file.load import TRACED, own_scene
 from tests.helpers.datasets import digest
 from tests.helpers.scene_files import old_xml, write, xml
 from tests.test_cli import fails
@@ -65,7 +66,7 @@ def test_what_is_not_honoured_is_kept_with_the_data(made):
     facts = json.loads((made / "data" / "dataset.json").read_text())
     assert facts["profile"] == str(made / "my.toml")
     assert len(facts["notes"]) == 2 and "phong" in facts["notes"][0] and "collimated" in facts["notes"][1]
-    assert set(facts["source"]) == {str(made / "my.toml"), str(made / "scene.xml")}
+    assert set(facts["source"]) == {"my.toml", "scene.xml"}
 
 
 def test_resuming_gives_the_same_bytes(made, tmp_path, capsys):
@@ -76,6 +77,19 @@ def test_resuming_gives_the_same_bytes(made, tmp_path, capsys):
     captured = capsys.readouterr()
     assert "1 clips rendered" in captured.out and "phong" in captured.out + captured.err
     assert digest(copy) == digest(made / "data")
+
+
+def test_a_moved_folder_is_resumed(made, tmp_path):
+    moved = shutil.copytree(made, tmp_path / "moved")
+    own_scene.cache_clear()
+    dataset = begun(moved / "data", str(moved / "my.toml"), 0, channels_read(["wskp6"]), NO_OPTIONS)
+    assert [shape.name for shape in scene_of(dataset.clips("test")[0], dataset)[0].meshes] == ["ball", "lost"]
+    assert Dataset(moved / "data").facts["profile"] == str(moved / "my.toml")
+
+
+def test_shares_of_light_are_not_compared():
+    few, more = (["fog: left out", f"with 1 bounce only {share} {TRACED} arrives"] for share in (12, 13))
+    assert portable("notes", few) == portable("notes", more) == ["fog: left out"]
 
 
 def test_files_that_the_scene_file_names_are_part_of_its_source(tmp_path):

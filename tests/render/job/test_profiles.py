@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from datasets.channels import CHANNELS, HIT_CHANNELS, MOTION_CHANNELS, SAMPLE_BUFFERS, USUAL_CHANNELS
-from datasets.clip import Clip, ClipKind
+from datasets.clip import SPLITS, Clip, ClipKind
 from datasets.frame import read_frame
 from datasets.info import size_in_full, stored_size, summarise
 from errors import BadInput
@@ -185,6 +185,14 @@ def test_rooms_that_all_need_too_many_samples_end_the_search(monkeypatch):
 def test_rooms_need_a_room_and_two_buffers(name):
     with pytest.raises(BadInput, match="2 spp or more"):
         profile_of(name)
+
+
+def test_rooms_to_test_on_are_not_trained_on():
+    profile = profile_of("rooms-1000x16")
+    rooms = [room for split in SPLITS for room in clips_of(profile, split, seed=0)]
+    assert len(set(rooms)) == len(rooms) == 1007
+    with pytest.raises(BadInput, match="at most 1000 rooms"):
+        profile_of("rooms-1001x16")
 
 
 READS = channels_read(["accumulated", "rae"])  # not dual_motion, which cannot be derived

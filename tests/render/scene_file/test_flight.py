@@ -8,6 +8,7 @@ import pytest
 from render.scene_file.flight import Space, fly, start_at, upright
 from render.stage import Stage
 from scenes.animation import Camera, Scene, StockLight, StockShape, Track
+from scenes.camera import Y_UP, look_at
 
 FRAMES = 12
 SEEDS = range(8)
@@ -137,6 +138,16 @@ def test_odd_places_are_survived(eye):
         assert all(np.isfinite(scene([], flown).view(frame, 4, 4).camera_to_world).all() for frame in range(FRAMES))
     if not np.any(eye):
         assert (np.abs(fine(fly(stage, camera, FRAMES, 3, True))) < 0.5).all()
+
+
+@pytest.mark.parametrize("is_said", [True, False])
+@pytest.mark.parametrize("forward", [[0, -3, -2], [-1, 3, -1.5], [-2, -3, 0], [0, -3, 2]])
+def test_the_worlds_up_is_that_of_steep_cameras(forward, is_said):
+    """By the file, or else by the axes of its image, but for the last: z upwards fits that, too."""
+    eye, forward = np.zeros(3), np.array(forward, np.float64)
+    camera = Camera.at_rest(eye, forward, 50.0, Y_UP if is_said else look_at(eye, forward)[:3, 1])
+    expected = Y_UP if is_said or forward[2] < 2 else [0, 0, 1]
+    np.testing.assert_array_equal(upright(camera).up.at(0), expected)
 
 
 def test_a_rolled_camera_stays_rolled():

@@ -9,7 +9,7 @@ from render.gbuffer import render_gbuffer
 from render.path import PosedFrame
 from render.scene_file.load import OwnScene
 from render.stage import Stage
-from scenes.camera import pixel_centres
+from scenes.camera import look_at, pixel_centres
 from tests.helpers.rendering import posed_surfaces
 from tests.helpers.scene_files import own, painted, refusal, xml
 
@@ -39,6 +39,21 @@ def test_damaged_meshes_are_refused(tmp_path, name, grouped):
         mesh = f'<shape type="shapegroup" id="g">{mesh}</shape><shape type="instance"><ref id="g"/></shape>'
     text = refusal(tmp_path, xml(mesh))
     assert "scene.xml" in text and name in text
+
+
+@pytest.mark.parametrize("normals", ["0 0 0", "0 0 1e-30"])
+def test_normals_without_a_direction_are_computed(tmp_path, normals):
+    lines = SOUND.replace("property float z\n", "property float z\n" + "".join(f"property float n{c}\n" for c in "xyz"))
+    for vertex in ("0 0 0", "1 0 0", "1 1 0"):
+        lines = lines.replace(f"\n{vertex}\n", f"\n{vertex} {normals}\n")
+    (tmp_path / "a.ply").write_text(lines)
+    mesh = '<shape type="ply" id="a"><string name="filename" value="a.ply"/></shape>'
+    for scene in (own(tmp_path, xml(shape=mesh)), own(tmp_path, lines, name="b.ply")):
+        assert any("a" in note and "normals that are zero" in note for note in scene.notes)
+        assert not any(str(tmp_path) in note for note in scene.notes)
+        (name,) = (shape.name for shape in scene.scene.meshes)
+        stored = np.array(scene.stage.parameters[f"{name}.vertex_normals"]).reshape(-1, 3)
+        np.testing.assert_allclose(stored, [[0, 0, 1]] * 3, atol=1e-6)
 
 
 def test_damaged_pictures_are_refused(tmp_path):
@@ -174,6 +189,22 @@ def test_lamps_that_shine_through_glass_alone_need_more_bounces(tmp_path):
     (note,) = own(tmp_path, bulb_in_a_room(3)).notes
     assert note.startswith("with 2 bounces only 0 % of the light") and "set `bounces = " in note
     assert own(tmp_path, bulb_in_a_room(3), "bounces = 4").notes == []
+
+
+LOOK = '<lookat origin="1,4,3" target="0,0,0" up="0,1,0"/>'
+MATRIX = " ".join(f"{value:.9f}" for value in look_at(np.array([1.0, 4, 3]), np.zeros(3)).ravel())
+TO_Z_UP = '<rotate x="1" angle="90"/>'
+
+
+@pytest.mark.parametrize("transform", [LOOK, f'<scale x="-1"/>{LOOK}', LOOK + TO_Z_UP, f'<matrix value="{MATRIX}"/>'])
+def test_flights_and_keyframes_of_a_camera_that_looks_down_do_not_roll(tmp_path, transform):
+    camera = f'<sensor type="perspective"><transform name="to_world">{transform}</transform></sensor>'
+    keys = "[[camera]]\ntime = {}\nposition = {}\ntarget = [0, 0, 0]\n"
+    toml = keys.format(0, [0, 4, 3]) + keys.format(1, [-3, 1, 2]) + "[splits.val]\ncamera = 'auto'"
+    made = own(tmp_path, xml(camera=camera), toml)
+    for split in ("test", "val"):
+        left = made.clip(split, 0, 2, 0).view(1, 24, 32).camera_to_world[:3, 0]
+        assert left[2 if TO_Z_UP in transform else 1] == pytest.approx(0, abs=1e-9)
 
 
 def test_a_single_keyframe_counts(tmp_path):

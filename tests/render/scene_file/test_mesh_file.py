@@ -10,7 +10,9 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from errors import BadInput
-from render.scene_file.assets import linear_image, texture
+from render.backend import dr, mi
+from render.loading import to_mitsuba
+from render.scene_file.assets import linear_image, stored_texture, texture, unit_values
 from render.scene_file.mesh_file import MeshFile
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\n"
@@ -61,7 +63,7 @@ def test_materials_of_gltf(tmp_path):
     assert box.mesh.visual.uv.shape == (len(box.mesh.vertices), 2)
     bsdf = box.bsdf["bsdf"]
     assert bsdf["type"] == "principled"
-    np.testing.assert_allclose(bsdf["base_color"]["data"], linear_image(picture())[::-1], rtol=1e-6)
+    np.testing.assert_array_equal(bsdf["base_color"]["bitmap"], np.asarray(picture())[::-1])
     channels = np.asarray(picture(1), float)[::-1] / 255
     np.testing.assert_allclose(bsdf["roughness"]["data"], channels[..., 1:2] * 0.25, rtol=1e-5)
     np.testing.assert_allclose(bsdf["metallic"]["data"], channels[..., 2:3] * 0.5, rtol=1e-5)
@@ -91,6 +93,15 @@ def test_srgb_pictures_become_linear():
     values = linear_image(Image.fromarray(np.uint8([[[0, 10, 188]], [[255, 255, 255]]])))
     np.testing.assert_allclose(values, [[[0, 10 / 255 / 12.92, 0.5029]], [[1, 1, 1]]], atol=1e-4)
     assert texture(values)["data"][0, 0, 0] == 1  # the last row is v = 0
+
+
+@pytest.mark.parametrize(("raw", "values"), [(False, linear_image), (True, unit_values)])
+def test_pictures_that_are_stored_as_they_are_show_the_same(raw, values):
+    si = dr.zeros(mi.SurfaceInteraction3f, 64)
+    si.uv = mi.Point2f(*np.random.default_rng(0).random((2, 64)).astype(np.float32))
+    both = [stored_texture(picture(), raw), texture(values(picture()))]
+    colours = [np.array(mi.load_dict(to_mitsuba(each)).eval(si)) for each in both]
+    np.testing.assert_allclose(*colours, atol=1e-5)
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.5])
@@ -148,8 +159,8 @@ def test_materials_of_obj(tmp_path):
     assert ["gloss" in note for note in found.notes] == [True, False] and "transparency" in found.notes[1]
     (tmp_path / "m.mtl").write_text("newmtl red\nKd 0.8 0.2 0.4\nKs 0 0 0\nd 1\nmap_Kd tex.png\n")
     found = MeshFile(tmp_path / "scene.obj", 1.0)
-    stored = found.shapes[0].bsdf["bsdf"]["reflectance"]["data"]
-    np.testing.assert_allclose(stored, linear_image(picture())[::-1], rtol=1e-6)
+    stored = found.shapes[0].bsdf["bsdf"]["reflectance"]["bitmap"]
+    np.testing.assert_array_equal(stored, np.asarray(picture())[::-1])
     assert len(found.notes) == 1  # of the sky
 
 
@@ -248,6 +259,29 @@ def test_vertices_that_are_nowhere(tmp_path, vertex):
     (tmp_path / "scene.obj").write_text(TRIANGLE.replace("1 1 0", vertex) + "f 1/1 2/2 3/3\n")
     with pytest.raises(BadInput, match=r"scene\.obj: mesh 'scene_obj' is empty or damaged"):
         MeshFile(tmp_path / "scene.obj", 1.0)
+
+
+def test_faces_without_vertices(tmp_path):
+    path = tmp_path / "scene.ply"
+    box = trimesh.creation.box()
+    box.faces[0] = [0, 1, 9]
+    path.write_bytes(box.export(file_type="ply"))
+    with pytest.raises(BadInput, match=r"scene\.ply: mesh 'scene_ply' is damaged: it lacks vertices"):
+        MeshFile(path, 1.0)
+
+
+def test_what_of_a_mesh_would_make_pixels_nan_is_replaced(tmp_path):
+    """Normals without a direction, those that cancel out included, and texture coordinates."""
+    normals = "vn nan 0 0\nvn 0 0 0\nvn 0 0.6 0.8\n"
+    (tmp_path / "scene.obj").write_text(TRIANGLE.replace("vt 0 0", "vt nan 0") + normals + "f 1/1/1 2/2/2 3/3/3\n")
+    found = MeshFile(tmp_path / "scene.obj", 1.0)
+    assert any("normals" in note for note in found.notes) and any("coordinates" in note for note in found.notes)
+    mesh = found.shapes[0].mesh
+    np.testing.assert_allclose(mesh.vertex_normals, [[0, 0, 1], [0, 0, 1], [0, 0.6, 0.8]], atol=1e-9)
+    np.testing.assert_array_equal(mesh.visual.uv[0], 0)
+    (tmp_path / "scene.obj").write_text(TRIANGLE + "f 1 2 3\nf 3 2 1\n")
+    both_sides = MeshFile(tmp_path / "scene.obj", 1.0).shapes[0].mesh.vertex_normals
+    np.testing.assert_allclose(np.abs(both_sides), [[0, 0, 1]] * 3, atol=1e-9)
 
 
 def test_points_are_no_mesh(tmp_path):

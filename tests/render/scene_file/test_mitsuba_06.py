@@ -261,6 +261,16 @@ def test_numbers_mean_what_they_meant(tmp_path):
     assert (sun["sky_scale"], sun["sun_scale"], sun["sun_aperture"]) == (0, 3, pytest.approx(2 * 0.5358))
 
 
+def test_scaled_textures(tmp_path):
+    """Of relief in its own scale, of a constant colour in that."""
+    (tmp_path / "picture.png").touch()
+    relief = element("texture", "scale", floats(scale=0.1), element("texture", "bitmap", PICTURE))
+    bumps = old_xml(shape=painted(bsdf("bumpmap", floats(scale=0.5), relief, bsdf("plastic"))))
+    assert described(tmp_path, bumps)["bsdf"]["scale"] == pytest.approx(0.05)
+    plain = old_xml(shape=painted(texture("scale", floats(scale=0.5), values("rgb", value=0.2))))
+    assert described(tmp_path, plain)["bsdf"]["reflectance"]["value"] == pytest.approx([0.1] * 3)
+
+
 def test_a_file_without_version_is_old(tmp_path):
     notes = own(tmp_path, old_xml().replace(' version="0.6.0"', "")).notes
     assert notes == ["the file names no version: read as one of Mitsuba 0.6"]
