@@ -53,7 +53,7 @@ def test_options_and_channels_left_out_are_listed(tiny_copy):
     facts["channels"]["train"].remove("gradient")
     path.write_text(json.dumps(facts))
     card = card_of(Dataset(tiny_copy))
-    assert card["command"].endswith(" --halton") and "left out gradient" in page_of(card)
+    assert card["command"].endswith(" --halton") and "Only test clips have gradient" in page_of(card)
 
 
 def test_a_scene_of_ones_own_keeps_its_licence_and_lists_ignored_features(tiny_copy):

@@ -67,7 +67,7 @@ def test_digests_tell_our_scene_files_from_others(tmp_path, monkeypatch):
     there = {line.split()[0]: line for line in list_scenes(tmp_path).splitlines()[2:16]}
     assert there["kitchen"].endswith(" yes") and there["bathroom"].endswith(" missing")
     assert there["veach-ajar"].endswith("the scene.xml of our results")
-    assert there["glass-of-water"].endswith(f"another file than that of our results ({crc32})")
+    assert there["glass-of-water"].endswith(f"another scene.xml than that of our results ({crc32})")
 
 
 def test_our_own_scenes_are_listed_with_their_commands():

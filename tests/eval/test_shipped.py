@@ -23,7 +23,7 @@ from tests.helpers.training import tensors
 from tests.test_cli import fails
 
 RECIPE = {
-    "profile": "tiny",
+    "budget": "tiny",
     "seed": 3,
     "data": {"profile": "somewhere/my.toml", "seed": 4, "generator": 5, "scenes": ["a", "b"]},
     "loss": {"epsilon": 0.01},
@@ -54,7 +54,7 @@ def test_the_table_has_a_line_for_each(wskp3, capsys):
 
 
 def test_weights_that_a_script_trained_say_so(wskp3, tiny, tmp_path):
-    recipe = {key: value for key, value in RECIPE.items() if key != "profile"}
+    recipe = {key: value for key, value in RECIPE.items() if key != "budget"}
     save_weights(create("wskp3"), "wskp3", recipe, wskp3, MADE_BY)
     evaluate([tiny], tmp_path, "tiny", ["noisy", "wskp3"])
     wskp3.with_suffix(".md").write_text(HAND)
