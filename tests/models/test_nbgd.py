@@ -10,7 +10,6 @@ from torch import Tensor
 from models import compiled, registry
 from models.networks.nbgd import SPACINGS, grid_mean, grid_shape
 
-
 PLACE_ROUNDING = 10 * 2.0**-18  # of values up to 10, by that of float32 places among up to 64 cells
 
 
