@@ -34,7 +34,8 @@ def check(table: str) -> None:
     """Every row has the source of the first denoiser that it names, and there are several."""
     rows = table.partition("Pareto front")[0].splitlines()
     assert any("made from" in row for row in rows)
-    named = {row: name for row in rows if (name := next((w for w in words_of(row) if w.partition("+")[0] in DENOISERS), None))}
+    of_row = {row: [word for word in words_of(row) if word.partition("+")[0] in DENOISERS] for row in rows}
+    named = {row: names[0] for row, names in of_row.items() if names}
     assert len({*named.values()}) > 1
     for row, name in named.items():
         assert f" {prototype(name).made_from} " in row, row
