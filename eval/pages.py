@@ -67,6 +67,7 @@ def extract_keys(file: str, *keys: str) -> Callable[[Path], dict[str, Any]]:
 
 
 def extract_trade(runs: Path) -> dict[str, Any]:
+    """Denoisers by samples per pixel, with the metrics that are printed."""
     content = extract_keys("report/trade.json", "device", "size", "threads", "clips", "samples")(runs)
     rows = [row | {name: kept(row[name]) for name in ("metrics", "floors")} for row in content["samples"]]
     return content | {"samples": rows}
