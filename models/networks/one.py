@@ -360,14 +360,13 @@ class One(Denoiser):
         The filter needs nothing else: what only the network reads is freed on return. Parts of the light, if there
         are any, follow the whole in the accumulation, which has the same weights, and in the history's output.
         """
-        irradiance = frame.irradiance(self.signal)
-        noisy = irradiance.clamp(0.0, MAX_IRRADIANCE) * surface
+        noisy = frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         history, part_history, has_history = fetched(before, frame, surface)
         decoded, past = self.decoded_frame(frame, scale, noisy, history, has_history)
         if frame.parts is not None:
             outputs, accumulated = part_history.chunk(2, dim=1)
-            parts = part_irradiance(frame, irradiance, noisy)
+            parts = part_irradiance(frame, frame.irradiance(self.signal), noisy)
             both = [decoded.accumulated, torch.lerp(accumulated, parts, decoded.alpha[:, :1])]
             decoded = decoded._replace(accumulated=torch.cat(both, dim=1))
             past = torch.cat([past[:, :3], outputs], dim=1)
