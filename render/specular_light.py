@@ -48,8 +48,8 @@ def specular_light(
     total = np.zeros((count, 3))
     for _ in range(max_events + 1):
         if len(pixel):
-            none = np.zeros((max(0, MIN_BATCH - len(rays)), 9))
-            radiance, branches = stage.replay(branches_at_end, *map(upload, np.concatenate([rays, none]).T))
+            batch = np.pad(rays, ((0, max(0, MIN_BATCH - len(rays))), (0, 0)))  # rays without throughput end at once
+            radiance, branches = stage.replay(branches_at_end, *map(upload, batch.T))
             # In the order of chains; Dr.Jit would add in any order.
             np.add.at(total, pixel, columns(radiance)[: len(rays)])
             # Chains branch: a pixel that shows glass has several, and many have none.

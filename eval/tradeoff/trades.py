@@ -56,7 +56,8 @@ class Times:
 
         # Of code or packages that have changed since; files of older versions do not tell.
         self.warnings: list[str] = []
-        if bench.get("made_by", timed_with()) != timed_with():
+        here = timed_with()
+        if bench.get("made_by", here) != here:
             self.warnings = [f"{path} has times of other code or packages: measure again with `{self.command()}`"]
 
     def check_device(self) -> None:

@@ -225,7 +225,7 @@ class SceneFile:
             self.note("its film is cropped: the whole view is rendered", node)
         if "near_clip" in described or "far_clip" in described:
             self.note("near_clip and far_clip: nothing is clipped", node)
-        up = self.parsed.up_of(node)
+        up = self.parsed.lookat_up(node)
         self.sensor = described | {UP: up} if up else described
 
     def add_light(self, index: int) -> None:

@@ -246,7 +246,7 @@ class ParsedFile:
         """Where a node is described: " (line 12)"; nothing for one of a file that Mitsuba includes."""
         return "" if node.file_index else f" ({self.element(node.offset + 1).place.rpartition('/')[2]})"
 
-    def up_of(self, node: mi.parser.SceneNode) -> list[float] | None:
+    def lookat_up(self, node: mi.parser.SceneNode) -> list[float] | None:
         """The `up` of the <lookat> that a sensor's transform ends with; None where there is none that can be read."""
         steps = [] if node.file_index else self.element(node.offset + 1).findall("transform/*")
         last = steps[-1] if steps else None
