@@ -71,6 +71,7 @@ class Frame:
     source: str = ""  # names the clip in messages
     spp: Tensor | None = None  # samples per pixel of the noisy channels, (B, 1, 1, 1); None if unknown
     parts: Tensor | None = None  # noisy radiance of parts of the light, as of lights, side by side: (B, 3 P, H, W)
+    masks: int = 0  # how many parts, the last ones, are no light: their history does not follow changes of light
     # In training alone:
     colour_gain: Tensor | None = None  # what networks multiply their exposure by (RAE §4.3), (B, 3, 1, 1); None for 1
     whole: Tensor | None = None  # what running_scale measures in the frame that this is a crop of, (B, 2)

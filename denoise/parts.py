@@ -20,7 +20,7 @@ from models.networks.one import One
 class Parts:
     """Layers of the colour's file that are denoised beside the colour."""
 
-    layers: Sequence[ExrLayer]
+    layers: Sequence[ExrLayer]  # masks last
     denoiser: One
 
     @staticmethod
@@ -33,19 +33,20 @@ class Parts:
             return None
         if not isinstance(denoiser, One):
             raise BadInput("--aov needs a denoiser that is linear once its kernels are chosen: --denoiser one")
-        return Parts([part_layer(name, image) for name in names], denoiser)
+        layers = [part_layer(name, image) for name in names]
+        return Parts(sorted(layers, key=is_mask), denoiser)
 
     def added(self, frame: Frame, image: ExrImage) -> Frame:
         """The frame with these layers of its file, and one layer of glass: parts are divided by its albedo.
 
-        Layers of one channel are no light: they keep the divisor.
+        Layers of one channel are masks: they keep the divisor.
         """
         frame = blended(frame) if frame.has_layers else frame
         parts = []
         for layer in self.layers:
             values = to_tensor(image.stacked(layer.channels)).to(frame.divisor)
-            parts.append(values if len(layer.channels) == 3 else values * frame.divisor)
-        return replace(frame, parts=torch.cat(parts, dim=1))
+            parts.append(values * frame.divisor if is_mask(layer) else values)
+        return replace(frame, parts=torch.cat(parts, dim=1), masks=sum(map(is_mask, self.layers)))
 
     def write(self, image: ExrImage, frame: Frame, state: State, dtype: type | None) -> None:
         """Put the denoised layers in place of the noisy ones."""
@@ -55,9 +56,13 @@ class Parts:
             image.replace(layer.channels, planes_of(layer, part, frame.divisor), dtype)
 
 
+def is_mask(layer: ExrLayer) -> bool:
+    return len(layer.channels) == 1
+
+
 def planes_of(layer: ExrLayer, part: Tensor, divisor: Tensor) -> np.ndarray:
     """(H, W, 3), or (H, W, 1) of a layer of one channel."""
-    if len(layer.channels) == 1:
+    if is_mask(layer):
         part = (part / divisor).mean(dim=1, keepdim=True)
     return to_image(part)
 

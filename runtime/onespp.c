@@ -53,9 +53,9 @@ enum {
     FEATURES = 8, /* that pixels are compared by */
     TOGETHER = 4, /* features: so many lines are compared at a time */
     LEVELS = 6,   /* of the filter */
-    SPREADING = 2, /* of these: the first ones, which spread outliers before all of them filter */
-    FIRST_GUIDED = SPREADING + LEVELS, /* pass: every other level filters once more, guided by luminance */
-    PASSES = FIRST_GUIDED + LEVELS / 2,
+    SPREADING = 2, /* the first passes, which spread outliers before all levels filter */
+    FIRST_GUIDED = SPREADING + LEVELS, /* pass: from it on they are guided by luminance */
+    PASSES = FIRST_GUIDED + 4,
     DETAIL = 24,  /* hidden channels of the per-pixel layers */
     PATCH = 4,    /* pixels, 2 x 2 */
     WIDTH_A = 40, /* channels at 1/2 of the resolution */
@@ -71,11 +71,13 @@ enum {
 enum {
     HALF_CHUNK = CHUNK / 2,
     MIN_STRIP_ROWS = 64,
-    BLOCK = 16,       /* pixels, the side of the squares whose mean luminance is measured */
+    BLOCK = 16,       /* pixels, the side of the squares whose luminance is measured */
+    GAIN_RADIUS = 6,  /* blocks around one in which a change of light is looked for */
+    GAIN_TAPS = 2 * GAIN_RADIUS + 1,
     MEDIAN_GRID = 64, /* the median depth of large images is taken from about as many rows and columns */
     MAX_DEPTHS = (2 * MEDIAN_GRID - 1) * (2 * MEDIAN_GRID - 1),
     PAD = 16,   /* floats before a line of activations: alignment, and zeros to the left of the image */
-    MARGIN = 32, /* floats before and after other lines: the largest distance of taps of the filter */
+    MARGIN = 64, /* floats before and after other lines: the largest distance of taps of the filter */
     LINE = PITCH(CHUNK),
     HALF_LINE = PITCH(HALF_CHUNK), /* has room for the pixels beside the chunk, too */
     ALIGNMENT = 64,
@@ -100,6 +102,10 @@ enum {
 #define OUTLIER 8.f /* times the mean over 9 x 9 pixels: what is brighter is spread */
 #define GUIDANCE 30.f /* weight of squared differences of the guide beside those of features, for each sample */
 #define DARKEST 0.01f /* exposed luminance: what is darker looks alike to guided levels */
+#define GAIN_DEVIATION 2.f /* blocks, of the Gaussian that weights them */
+#define GAIN_NOISE 3.f /* standard errors: smaller changes of light do not count */
+#define MAX_GAIN 4.f /* of history, a frame */
+#define MIN_CHANGE 1e-30f /* of sums of luminance, to divide by */
 #define MAX_LOGIT 10.f
 #define MIN_LOGIT -40.f
 #define NO_WEIGHT -1e4f /* importance of pixels that show no surface */
@@ -107,7 +113,9 @@ enum {
 #define PLANE_TOLERANCE 0.01f /* of the depth: largest distance of a tap's surface from the point's plane */
 #define NORMAL_TOLERANCE 0.9f /* smallest cosine between a tap's normal and the point's */
 
-static const int TAP_SPACINGS[LEVELS] = {32, 16, 8, 4, 2, 1};
+/* Passes of the filter: levels, of which each has weights of its own, and pixels between taps. */
+static const int PASS_LEVELS[PASSES] = {0, 1, 0, 1, 2, 3, 4, 5, 0, 1, 3, 5};
+static const int TAP_SPACINGS[PASSES] = {64, 16, 32, 16, 8, 4, 2, 1, 64, 16, 4, 1};
 
 /* --- Arithmetic --------------------------------------------------------------------------------------------------- */
 
@@ -177,6 +185,8 @@ static float float_of_half(uint16_t half)
 }
 
 static int rounded_up(int x, int multiple) { return (x + multiple - 1) / multiple * multiple; }
+
+static int blocks_along(int size) { return (size + BLOCK - 1) / BLOCK; }
 
 /* --- State and memory --------------------------------------------------------------------------------------------- */
 
@@ -272,6 +282,13 @@ typedef struct {
     int count;
 } RunningMean;
 
+/* How the light of a block has changed where it has a history: sums over pixels. */
+typedef struct {
+    float past;           /* luminance of the history */
+    float change, square; /* that of the frame less that of the history, and its square */
+    float gain;           /* what the history is multiplied by */
+} Change;
+
 /* How a mesh moves from this frame's camera space to the world's axes around the previous eye. */
 typedef struct {
     float to_previous[3][4];
@@ -303,9 +320,11 @@ typedef struct {
 /* What each task works with. */
 typedef union {
     struct {
-        Neighbourhood around;
         float history[TEXEL][LINE]; /* the last lines are not used */
         float parts[MAX_PART_HISTORY][LINE];
+    } past;
+    struct {
+        Neighbourhood around;
         float most[LINE]; /* luminance of a pixel that is no outlier */
         float lines[2][INPUTS][LINE];
         float patches[PATCH * INPUTS][HALF_LINE];
@@ -356,6 +375,8 @@ struct onespp {
     float *zeros, *ones;          /* lines */
     Motion *motions;
     double *blocks; /* mean luminance of each, -1 without surfaces */
+    Change *changes; /* of the blocks' light */
+    Change *row_changes; /* the same, summed along rows */
     float *depths;
     Scratch *scratch;
     float *parameters;
@@ -438,6 +459,8 @@ static void lay_out(onespp *d, Arena *arena)
     d->object_to_world = allocate(arena, (uint64_t)d->config.max_meshes * 16, sizeof(double));
     d->motions = allocate(arena, (uint64_t)d->config.max_meshes + 1, sizeof(Motion));
     d->blocks = allocate(arena, blocks, sizeof(double));
+    d->changes = allocate(arena, blocks, sizeof(Change));
+    d->row_changes = allocate(arena, blocks, sizeof(Change));
     d->depths = allocate(arena, MAX_DEPTHS, sizeof(float));
     d->scratch = allocate(arena, (uint64_t)d->config.tasks, sizeof(Scratch));
     lay_out_layers(d, arena);
@@ -640,7 +663,7 @@ static void measure_rows(Job *job, Scratch *scratch, int first, int last)
 {
     (void)scratch;
     const onespp_frame *frame = &job->frame;
-    int columns = (frame->width + BLOCK - 1) / BLOCK;
+    int columns = blocks_along(frame->width);
     for (int row = first; row < last; row++)
         for (int x0 = 0; x0 < frame->width; x0 += CHUNK) {
             float sums[CHUNK / BLOCK] = {0};
@@ -707,7 +730,7 @@ static double log_depth(const onespp *d, const onespp_frame *frame)
 static void measure(Job *job)
 {
     onespp *d = job->d;
-    int columns = (job->frame.width + BLOCK - 1) / BLOCK, rows = (job->frame.height + BLOCK - 1) / BLOCK;
+    int columns = blocks_along(job->frame.width), rows = blocks_along(job->frame.height);
     run(job, measure_rows, 0, rows);
     update(&d->log_luminance, log_luminance(d->blocks, columns * rows));
     update(&d->log_depth, log_depth(d, &job->frame));
@@ -971,6 +994,140 @@ static void reproject(
             parts[c][i] = of_part[c];
     }
     split_texels(history, texels[0], n);
+}
+
+/* --- Changes of light: the history follows them ------------------------------------------------------------------- */
+
+/* Adds n pixels of a row, from the first of a block on, to the changes of the blocks that they lie in. */
+static void add_change(const Job *job, int y, int x0, int n, Change *changes)
+{
+    const onespp *d = job->d;
+    const float *noisy = row_line(d, y, NOISY_LINES) + x0, *output = row_line(d, y, OUTPUT_LINES) + x0;
+    const float *length = row_line(d, y, LENGTH_LINE) + x0;
+    float past[LINE], change[LINE];
+    for (int i = 0; i < n; i++) {
+        float now = luminance(noisy[i], noisy[d->pitch + i], noisy[2 * d->pitch + i]);
+        float before = minf(luminance(output[i], output[d->pitch + i], output[2 * d->pitch + i]), MAX_LUMINANCE);
+        past[i] = length[i] > 0 ? before : 0;
+        change[i] = length[i] > 0 ? minf(now, MAX_LUMINANCE) - before : 0;
+    }
+    for (int i = 0; i < n; i++) {
+        Change *block = changes + i / BLOCK;
+        block->past += past[i];
+        block->change += change[i];
+        block->square += change[i] * change[i];
+    }
+}
+
+/* Keeps the reprojected history of n pixels of a row. */
+static void keep_history(const Job *job, Scratch *scratch, int y, int x0, int n)
+{
+    float(*history)[LINE] = scratch->past.history, (*parts)[LINE] = scratch->past.parts;
+    reproject(job, y, x0, n, history, parts);
+    for (int c = 0; c < HISTORY; c++)
+        memcpy(row_line(job->d, y, OUTPUT_LINES + c) + x0, history[c], sizeof(float) * (size_t)n);
+    for (int c = 0; c < PART_HISTORY * job->frame.parts; c++)
+        memcpy(part_line(job->d, y, c / PART_HISTORY, c % PART_HISTORY) + x0, parts[c], sizeof(float) * (size_t)n);
+}
+
+/* The rows are those of blocks. */
+static void reproject_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    int columns = blocks_along(job->frame.width);
+    for (int row = first; row < last; row++) {
+        Change *changes = job->d->changes + (ptrdiff_t)row * columns;
+        memset(changes, 0, sizeof *changes * (size_t)columns);
+        for (int y = row * BLOCK; y < mini((row + 1) * BLOCK, job->frame.height); y++)
+            for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
+                int n = mini(CHUNK, job->frame.width - x0);
+                keep_history(job, scratch, y, x0, n);
+                add_change(job, y, x0, n, changes + x0 / BLOCK);
+            }
+    }
+}
+
+/* The weighted sum of changes around the one at `index` of `count`, `step` apart. */
+static Change sum_around(const Change *changes, int index, int count, ptrdiff_t step, const float *weights)
+{
+    Change sum = {0, 0, 0, 1};
+    for (int tap = maxi(0, GAIN_RADIUS - index); tap < mini(GAIN_TAPS, count - index + GAIN_RADIUS); tap++) {
+        const Change *there = changes + (index + tap - GAIN_RADIUS) * step;
+        sum.past += weights[tap] * there->past;
+        sum.change += weights[tap] * there->change;
+        sum.square += weights[tap] * there->square;
+    }
+    return sum;
+}
+
+/* What a history is multiplied by where its surroundings have changed: the ratio, shrunk by the noise of the change. The
+ * squared standard error of a sum of values d with weights w is that of w^2 d^2, for a Gaussian w half that of w d^2. */
+static float gain_of(const Change *around)
+{
+    float size = maxf(fabsf(around->change), MIN_CHANGE);
+    float noise = GAIN_NOISE * GAIN_NOISE / 2 * around->square / size / size;
+    float relative = maxf(minf(around->change / maxf(around->past, MIN_CHANGE), MAX_GAIN - 1), 1 / MAX_GAIN - 1);
+    return 1 + maxf(1 - noise, 0) * relative;
+}
+
+/* The gain of each block. */
+static void find_gains(const Job *job)
+{
+    onespp *d = job->d;
+    int columns = blocks_along(job->frame.width), rows = blocks_along(job->frame.height);
+    float weights[GAIN_TAPS];
+    for (int i = 0; i < GAIN_TAPS; i++) {
+        float distance = (float)(i - GAIN_RADIUS) / GAIN_DEVIATION;
+        weights[i] = expf(-distance * distance / 2);
+    }
+    for (int i = 0; i < rows * columns; i++)
+        d->row_changes[i] = sum_around(d->changes + i / columns * columns, i % columns, columns, 1, weights);
+    for (int i = 0; i < rows * columns; i++) {
+        Change around = sum_around(d->row_changes + i % columns, i / columns, rows, columns, weights);
+        d->changes[i].gain = gain_of(&around);
+    }
+}
+
+/* Where a pixel lies between the centres of blocks: the one before it, and how far it is to the next. */
+static float between_blocks(int pixel, int *before)
+{
+    float place = maxf(((float)pixel + 0.5f) / BLOCK - 0.5f, 0);
+    *before = (int)place;
+    return place - (float)*before;
+}
+
+/* Multiplies the light in the history of n pixels of a row by the gain, interpolated between blocks. */
+static void follow_light(const Job *job, int y, int x0, int n)
+{
+    const onespp *d = job->d;
+    int columns = blocks_along(job->frame.width), rows = blocks_along(job->frame.height), above, left;
+    float gain[LINE], down = between_blocks(y, &above);
+    const Change *upper = d->changes + (ptrdiff_t)above * columns;
+    const Change *lower = d->changes + (ptrdiff_t)mini(above + 1, rows - 1) * columns;
+    for (int i = 0; i < n; i++) {
+        float across = between_blocks(x0 + i, &left);
+        int right = mini(left + 1, columns - 1);
+        float first = upper[left].gain + down * (lower[left].gain - upper[left].gain);
+        float second = upper[right].gain + down * (lower[right].gain - upper[right].gain);
+        gain[i] = first + across * (second - first);
+    }
+    for (int c = OUTPUT; c < LENGTH; c++) {
+        float *restrict line = row_line(d, y, OUTPUT_LINES + c) + x0;
+        for (int i = 0; i < n; i++)
+            line[i] *= gain[i];
+    }
+    for (int c = 0; c < PART_HISTORY * job->frame.parts; c++) {
+        float *restrict line = part_line(d, y, c / PART_HISTORY, c % PART_HISTORY) + x0;
+        for (int i = 0; i < n; i++)
+            line[i] *= gain[i];
+    }
+}
+
+static void follow_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    (void)scratch;
+    for (int y = first; y < last; y++)
+        for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK)
+            follow_light(job, y, x0, mini(CHUNK, job->frame.width - x0));
 }
 
 /* --- Statistics over neighbours of the same mesh ------------------------------------------------------------------ */
@@ -1315,14 +1472,15 @@ static void fill_statistics(
 }
 
 /* The lines of the reprojected history; without one, its images are those of this frame. */
-static void fill_history(const Job *job, float (*restrict history)[LINE], int n, float (*restrict lines)[LINE])
+static void fill_history(const Job *job, int y, int x0, int n, float (*restrict lines)[LINE])
 {
+    const onespp *d = job->d;
     float samples = job->frame.samples;
-    const float *length = history[LENGTH];
+    const float *length = row_line(d, y, LENGTH_LINE) + x0;
     for (int c = 0; c < RGB; c++) {
         float *output = lines[OUTPUT_INPUT + c], *accumulated = lines[ACCUMULATED_INPUT + c];
-        expose(output, history[OUTPUT + c], job->exposure, n);
-        expose(accumulated, history[ACCUMULATED + c], job->exposure, n);
+        expose(output, row_line(d, y, OUTPUT_LINES + c) + x0, job->exposure, n);
+        expose(accumulated, row_line(d, y, ACCUMULATED_LINES + c) + x0, job->exposure, n);
         for (int i = 0; i < n; i++) {
             output[i] = length[i] > 0 ? output[i] : lines[MEAN_9X9_INPUT + c][i];
             accumulated[i] = length[i] > 0 ? accumulated[i] : lines[NOISY_INPUT + c][i];
@@ -1334,7 +1492,7 @@ static void fill_history(const Job *job, float (*restrict history)[LINE], int n,
         lines[HAS_HISTORY_INPUT][i] = length[i] > 0 ? 1.f : 0.f;
     }
     for (int c = 0; c < LATENT; c++)
-        memcpy(lines[LATENT_INPUT + c], history[LATENT_FROM + c], sizeof(float) * (size_t)n);
+        memcpy(lines[LATENT_INPUT + c], row_line(d, y, LATENT_LINES + c) + x0, sizeof(float) * (size_t)n);
 }
 
 /* The lines of surfaces: albedo, normal in view space, depth and roughness. */
@@ -1367,28 +1525,20 @@ static void fill_surface(const Job *job, int y, int x0, int n, float (*restrict 
 static void fill_inputs(const Job *job, Scratch *scratch, int y, int x0, int n, float (*restrict lines)[LINE])
 {
     sum_neighbours(job, &scratch->enter.around, y, x0);
-    reproject(job, y, x0, n, scratch->enter.history, scratch->enter.parts);
     fill_statistics(job, &scratch->enter.around, y, n, lines, scratch->enter.most);
-    fill_history(job, scratch->enter.history, n, lines);
+    fill_history(job, y, x0, n, lines);
     fill_surface(job, y, x0, n, lines);
     for (int c = 0; c < INPUTS; c++)
         for (int i = n; i < CHUNK; i++)
             lines[c][i] = lines[c][n - 1];
 }
 
-/* What `leave` needs of a chunk of a row: the history of images and its length, how bright an outlier is, and the hidden
- * per-pixel layer. */
+/* What `leave` needs of a chunk of a row: how bright an outlier is, and the hidden per-pixel layer. */
 static void keep_row(const Job *job, Scratch *scratch, int y, int x0, int n, float (*lines)[LINE])
 {
     const onespp *d = job->d;
     const float *inputs[INPUTS];
-    for (int c = OUTPUT; c <= LENGTH; c++)
-        memcpy(row_line(d, y, OUTPUT_LINES + c) + x0, scratch->enter.history[c], sizeof(float) * (size_t)n);
     memcpy(row_line(d, y, OUTLIER_LINE) + x0, scratch->enter.most, sizeof(float) * (size_t)n);
-    for (int c = 0; c < PART_HISTORY * job->frame.parts; c++) {
-        float *to = part_line(d, y, c / PART_HISTORY, c % PART_HISTORY) + x0;
-        memcpy(to, scratch->enter.parts[c], sizeof(float) * (size_t)n);
-    }
     for (int c = 0; c < INPUTS; c++)
         inputs[c] = lines[c];
     multiply(&d->layers[DETAIL_1], inputs, 0, n, line_of(&d->hidden, y, 0) + x0, d->hidden.pitch, RECTIFIED);
@@ -1644,14 +1794,6 @@ static void run_network(Job *job)
 
 /* --- The filter --------------------------------------------------------------------------------------------------- */
 
-/* The level that a pass takes. */
-static int level_of(int pass)
-{
-    if (pass >= FIRST_GUIDED)
-        return 2 * (pass - FIRST_GUIDED) + 1;
-    return pass < SPREADING ? pass : pass - SPREADING;
-}
-
 /* A line of a pass's output: colours and mass, then colours of parts of the light. It is in the texels, which are no longer
  * needed and have room for two images, in turn; as the last pass writes texels, what that filters is over the first
  * parameters. Pass -1 is what pass 0 filters. */
@@ -1721,7 +1863,7 @@ static void weigh_tap(
 static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *restrict scale, int y, int x0, int n)
 {
     const onespp *d = job->d;
-    int level = level_of(job->pass), step = TAP_SPACINGS[level], line = LEVEL_LINES + 3 * level;
+    int step = TAP_SPACINGS[job->pass], line = LEVEL_LINES + 3 * PASS_LEVELS[job->pass];
     const float *features = row_line(d, y, FEATURE_LINES) + x0, *guide = row_line(d, y, GUIDE_LINE) + x0;
     const float *sharpness = row_line(d, y, line) + x0, *centre = sharpness + d->pitch, *importance = centre + d->pitch;
     const float *samples = row_line(d, y, LENGTH_LINE) + x0;
@@ -1765,7 +1907,7 @@ static void sum_weighted(
 /* A pass of the filter at n pixels of a row: `to` has a line for each channel. */
 static void filter_chunk(const Job *job, float *const *to, int y, int x0, int n)
 {
-    int step = TAP_SPACINGS[level_of(job->pass)];
+    int step = TAP_SPACINGS[job->pass];
     float weights[TAPS][LINE], scale[LINE];
     weigh_taps(job, weights, scale, y, x0, n);
     for (int c = 0; c < filtered_channels(job); c++) {
@@ -1830,7 +1972,7 @@ static void filter_rows(Job *job, Scratch *scratch, int first, int last)
 {
     (void)scratch;
     float *to[MAX_FILTERED];
-    int step = TAP_SPACINGS[level_of(job->pass)];
+    int step = TAP_SPACINGS[job->pass];
     for (int start = first; start < mini(first + step, last); start++)
         for (int y = start; y < last; y += step) /* two of the three rows that it needs are in the cache */
             for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
@@ -2027,6 +2169,9 @@ static int denoise(onespp *d, const onespp_frame *frame, const onespp_output *ra
         reset(d);
     measure(&job);
     set_up_geometry(&job);
+    run(&job, reproject_rows, 0, blocks_along(frame->height));
+    find_gains(&job);
+    run(&job, follow_rows, 0, frame->height);
     run_network(&job);
     run_filter(&job);
     d->width = frame->width;

@@ -24,10 +24,11 @@ if TYPE_CHECKING:
 
 LATENT = 6  # channels carried beside images, in [-1, 1]
 FEATURES = 8  # that pixels are compared by
-# px between taps of each filter level: the last ones smooth the first ones' pattern
-TAP_SPACINGS = (32, 16, 8, 4, 2, 1)
-SPREADING_LEVELS = slice(2)  # of these, those that spread outliers before all of them filter
-GUIDED_LEVELS = slice(1, None, 2)  # of these, those that filter once more, guided by luminance
+# Passes of the filter: levels, of which each has weights of its own, and px between taps. The last ones smooth the
+# first ones' pattern.
+FILTER_PASSES = ((0, 32), (1, 16), (2, 8), (3, 4), (4, 2), (5, 1))
+SPREADING_PASSES = ((0, 64), (1, 16))  # those of outliers before them
+GUIDED_PASSES = ((0, 64), (1, 16), (3, 4), (5, 1))  # those after them, guided by luminance
 GUIDANCE = 30.0  # weight of squared differences of log luminance beside those of features, for each sample
 DARKEST = 0.01  # exposed luminance: what is darker looks alike to guided levels
 OUTLIER = 8.0  # times the mean over 9 x 9 pixels: what is brighter is spread
@@ -57,7 +58,7 @@ INPUT_CHANNELS = {
 
 
 # The outputs of the network in order, and how many channels each has.
-LEVELS = len(TAP_SPACINGS)
+LEVELS = len(FILTER_PASSES)
 HEAD_CHANNELS = {
     "features": FEATURES,
     "sharpness": LEVELS,

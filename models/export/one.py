@@ -8,12 +8,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from models import compiled
 from models.compiled.affinity import MIN_LOGIT
 from models.compiled.one import SIDE_MULTIPLE
 from models.export.history import updated_scale
 from models.export.step import Step, Warp, bounded, demodulation, image
 from models.filters.neighbours import means_of, summands
-from models.networks.one import HISTORY, PATCH, Decoded, One, PixelInputs, carried, decode, input_channels
+from models.history.light_gain import follow_light
+from models.networks.one import HISTORY, PATCH, WHOLE, Decoded, One, PixelInputs, carried, decode, input_channels
 from models.operators import MAX_IRRADIANCE, MIN_DIVISOR
 
 COARSE_PADDING = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
@@ -128,7 +130,9 @@ class OneStep(Step):
         sums_3x3 = mesh_sums(summands(noisy), mesh, 1)
         means = means_of(sums_3x3, mesh_sums(sums_3x3, mesh, 3))
         history = self.reprojected_history(x)
-        has_history = (history[:, 6:7] > 0).to(noisy) * surface  # after the first frame, no length is 0
+        has_history = (history[:, WHOLE : WHOLE + 1] > 0).to(noisy) * surface  # after the first frame, no length is 0
+        with compiled.disabled():
+            history = follow_light(history, noisy, has_history, lights=WHOLE)
         inputs = PixelInputs(noisy, *means, history, has_history)
         to_view = torch.tensor((-1.0, 1.0, -1.0))[:, None] * x["camera_to_world"][:3, :3].T  # see Frame.to_view
         normal = (to_view @ x["normal"].view(3, -1)).view_as(x["normal"])

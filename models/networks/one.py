@@ -1,4 +1,4 @@
-"""`one`: our own recurrent denoiser: convex kernels on irradiance, and history by validated reprojection."""
+"""`one`: our own recurrent denoiser: convex kernels on irradiance, and validated history that follows the light."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,8 +15,9 @@ from models.compiled import one as kernels
 from models.compiled.affinity import MIN_LOGIT
 from models.compiled.one import (
     DARKEST,
+    FILTER_PASSES,
     GUIDANCE,
-    GUIDED_LEVELS,
+    GUIDED_PASSES,
     HEAD_CHANNELS,
     INPUT_CHANNELS,
     LATENT,
@@ -25,12 +26,12 @@ from models.compiled.one import (
     MIN_LENGTH,
     OUTLIER,
     SIDE_MULTIPLE,
-    SPREADING_LEVELS,
-    TAP_SPACINGS,
+    SPREADING_PASSES,
 )
 from models.denoiser import NO_FLOAT16, Denoiser, State, matching_state
 from models.filters.neighbours import mesh_means, taps_3x3
 from models.history.geometry import GBuffer
+from models.history.light_gain import follow_light
 from models.history.reprojection import reproject
 from models.history.running_scale import RunningScale, running_scale
 from models.networks.convolution import ConvReLU
@@ -42,6 +43,7 @@ NETWORK_REACH = 32  # rows above and below that predictions depend on: 28 by the
 NETWORK_SURFACE = ("albedo", "normal", "depth", "roughness", "mesh_id")  # channels that decoded_rows reads
 MAX_PART = 100 * MAX_IRRADIANCE  # of either sign: parts of the light may cancel each other
 HISTORY = (3, 3, 1, LATENT)  # channels: output and accumulated irradiance, the latter's effective length, latent
+WHOLE = 6  # of these, the first: irradiance
 
 
 class Trunk(nn.Module):
@@ -230,28 +232,26 @@ def carried(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The channels HISTORY after a frame: the new accumulation, filtered level by level, is blended into the `past`.
 
-    Outliers pass through the coarsest levels twice, which spreads them wider and cuts nothing off. After all levels
-    some filter once more, guided by the luminance that there is by then. A channel of ones takes the same way: it
+    Outliers pass through coarse levels twice, which spreads them wider and cuts nothing off. After all levels some
+    filter once more, guided by the luminance that there is by then. A channel of ones takes the same way: it
     becomes the sum of all weights, by which the result is divided. Weights are those of the whole, so that parts of the
     light add up to it: their images may follow the accumulation and the past output.
     """
     planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
-    levels = [*zip(*planes, TAP_SPACINGS, strict=True)]
+    maps = [*zip(*planes, strict=True)]
 
-    def filtered(
-        image: Tensor, sharpness: Tensor, centre: Tensor, importance: Tensor, step: int, *guide: Tensor
-    ) -> Tensor:
-        return level(image, decoded.features, sharpness, centre, importance, surface, step, *guide)
+    def filtered(image: Tensor, index: int, step: int, *guide: Tensor) -> Tensor:
+        return level(image, decoded.features, *maps[index], surface, step, *guide)
 
     light = torch.cat([decoded.accumulated, surface], dim=1)
     outliers = decoded.outliers * light
     light = light - outliers
-    for each in levels[SPREADING_LEVELS]:
+    for each in SPREADING_PASSES:
         outliers = filtered(outliers, *each)
     light = light + outliers
-    for each in levels:
+    for each in FILTER_PASSES:
         light = filtered(light, *each)
-    for each in levels[GUIDED_LEVELS]:
+    for each in GUIDED_PASSES:
         light = filtered(light, *each, luminance_guide(light, decoded.length, exposure))
     image = light[:, :-1] / light[:, -1:].clamp(min=MIN_DIVISOR)
     output = torch.lerp(past[:, : image.shape[1]], image, decoded.alpha[:, 1:]) * surface
@@ -300,17 +300,30 @@ def network_inputs(frame: Frame, scale: RunningScale, inputs: PixelInputs, hidde
     return patches_of(channels), pixels
 
 
-def fetched(before: OneState | None, frame: Frame, surface: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the previous frame, reprojected: the channels HISTORY, those of parts, and 1 where they are valid, else 0."""
+def fetched(before: OneState | None, frame: Frame, noisy: Tensor, surface: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the previous frame, reprojected: the channels HISTORY, those of parts, and 1 where they are valid, else 0.
+
+    Irradiance among them follows the changes of `noisy`, the frame's (B, 3, H, W).
+    """
+    parts = count_of_parts(frame)
     has_history = torch.zeros_like(surface)
     if before is None:
         nothing = has_history.expand(-1, sum(HISTORY), -1, -1)
-        return nothing, has_history.expand(-1, 2 * count_of_parts(frame), -1, -1), has_history
-    images = before.output, before.accumulated, before.length, before.latent
-    past = torch.cat([*images, before.part_output, before.part_accumulated], dim=1)
-    history, valid = reproject(frame, past, before.gbuffer)
-    history, parts = history.split([sum(HISTORY), 2 * count_of_parts(frame)], dim=1)
-    return history, parts, valid.to(history) * surface
+        return nothing, has_history.expand(-1, 2 * parts, -1, -1), has_history
+    lights = parts - 3 * frame.masks
+    light, light_accumulated = (image[:, :lights] for image in (before.part_output, before.part_accumulated))
+    mask, mask_accumulated = (image[:, lights:] for image in (before.part_output, before.part_accumulated))
+    images = before.output, before.accumulated, light, light_accumulated
+    others = before.length, before.latent, mask, mask_accumulated
+    history, valid = reproject(frame, torch.cat([*images, *others], dim=1), before.gbuffer)
+    has_history = valid.to(history) * surface
+    history = follow_light(history, noisy, has_history, WHOLE + 2 * lights)
+    if parts == 0:
+        return history, history[:, :0], has_history
+    sizes = WHOLE, lights, lights, 1 + LATENT, parts - lights, parts - lights
+    whole, light, light_accumulated, rest, mask, mask_accumulated = history.split(sizes, dim=1)
+    of_parts = torch.cat([light, mask, light_accumulated, mask_accumulated], dim=1)
+    return torch.cat([whole, rest], dim=1), of_parts, has_history
 
 
 def count_of_parts(frame: Frame) -> int:
@@ -334,7 +347,6 @@ class One(Denoiser):
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion")
     refuses = NO_FLOAT16
     is_network = True
-    convex = True
     inputs = INPUT_CHANNELS
     widths: ClassVar[tuple[int, int, int]] = (40, 56, 64)
 
@@ -362,7 +374,7 @@ class One(Denoiser):
         """
         noisy = frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
-        history, part_history, has_history = fetched(before, frame, surface)
+        history, part_history, has_history = fetched(before, frame, noisy, surface)
         decoded, past = self.decoded_frame(frame, scale, noisy, history, has_history)
         if frame.parts is not None:
             outputs, accumulated = part_history.chunk(2, dim=1)

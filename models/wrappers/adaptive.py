@@ -29,6 +29,7 @@ from models.filters.baselines import AccumulatedState, Accumulating
 from models.filters.svgf import geometry_weight, pack_geometry
 from models.history.accumulation import Accumulation
 from models.history.geometry import GBuffer
+from models.history.light_gain import MAX_GAIN
 from models.history.reprojection import reproject
 from models.operators import MAX_IRRADIANCE, MAX_LUMINANCE, MIN_DIVISOR, image_luminance
 from models.wrappers.wrapper import Wrapper
@@ -37,7 +38,6 @@ STRATA_RADIUS = 3  # windows of 7 x 7 strata
 FIREFLY_RATIO = 3.0  # largest luminance of a sample, times the mean of its neighbourhood
 T_SQUARED_OF_NOISE = 6.0  # up to which a difference counts as noise; 1.4 % of normally distributed ones are larger
 T_SQUARED_OF_CHANGE = 12.0  # from which on it counts in full; 0.05 %
-MAX_GAIN = 4.0  # of history, per frame
 GAIN_ITERATIONS = 3  # towards the limit at which the newest frame is to be clamped
 
 

@@ -54,7 +54,7 @@ def test_parts_add_up_and_the_whole_is_what_it_is_without_them(denoiser, frames)
 
 
 def test_a_part_that_is_all_of_the_light_is_the_whole_and_a_constant_stays_one(denoiser, frames):
-    given = [replace(f, parts=torch.cat([f.direct + f.indirect, 0.25 * f.divisor], dim=1)) for f in frames]
+    given = [replace(f, parts=torch.cat([f.direct + f.indirect, 0.25 * f.divisor], dim=1), masks=1) for f in frames]
     for (whole, parts), frame in zip(played(denoiser, given), given, strict=True):
         torch.testing.assert_close(parts[:, 0], torch.where(frame.depth > 0, whole, parts[:, 0]), rtol=1e-5, atol=1e-6)
         constant = torch.where(frame.depth > 0, parts[:, 1] / frame.divisor, 0.25)
