@@ -60,7 +60,8 @@ typedef struct {
 } onespp_ids;
 
 /* A part of the light, such as that of one lamp: it is denoised by the kernels that are chosen for the whole, so parts
- * whose noisy radiance adds up to `direct` plus `indirect` do so denoised. Background stays as it is. */
+ * whose noisy radiance adds up to `direct` plus `indirect` do so denoised. Its past is scaled by changes of the whole, so
+ * it must be light: a mask would not stay between 0 and 1. Background stays as it is. */
 typedef struct {
     onespp_image noisy;     /* 3 channels of radiance, of either sign */
     onespp_output radiance; /* 3; may be the noisy image itself, and overlap no other input */

@@ -1,7 +1,7 @@
-"""A history that follows the light: what tiles of a frame have become brighter or darker by, it is multiplied by.
+"""A history that follows the light: it is multiplied by how much brighter or darker its surroundings have become.
 
 Highlights that slide over glossy surfaces, and lamps that dim, change whole neighbourhoods. History that is multiplied
-by the ratio stays as free of noise as it was; a larger weight of the newest frame would add noise.
+by the ratio of means stays as free of noise as it was; a larger weight of the newest frame would add noise.
 """
 
 import torch

@@ -108,7 +108,8 @@ class Denoiser:
         - reset: whether to forget all frames before, as after a cut
         - parts, float32 arrays (H, W, 3): noisy radiance of parts of the light, such as that of one lamp, of either
           sign. They are replaced by denoised radiance: parts that add up to the color and indirect light do so
-          afterwards. Another number of parts than before resets
+          afterwards. They must be light, for their past is scaled by changes of the whole. Another number of parts
+          than before resets
 
         Raises ValueError for a wrong shape, or a number that is out of range, and TypeError for what is no array of
         such numbers on the CPU. After an error the state is what it was.
