@@ -15,11 +15,11 @@ from models.operators import MAX_LUMINANCE
 TILE = 16  # px
 
 
-def between_tiles(count: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """For `size` pixels in a row: which of `count` tiles have centres before and after each, and its place between."""
+def between_tiles(size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """For `size` pixels in a row: which tiles have centres before and after each, and its place between them."""
     place = ((torch.arange(size) + 0.5) / TILE - 0.5).clamp(min=0)
     before = place.long()
-    return before, (before + 1).clamp(max=count - 1), place - before
+    return before, (before + 1).clamp(max=(size - 1) // TILE), place - before
 
 
 @jit_in_any_order
@@ -88,14 +88,14 @@ def multiply_rows(history: Image, gain: Plane, lights: int, rows: Between, colum
             scale_line(history[c, y], line)
 
 
-def arrays_between(count: int, size: int) -> Between:
-    before, after, share = between_tiles(count, size)
+def arrays_between(size: int) -> Between:
+    before, after, share = between_tiles(size)
     return before.numpy(), after.numpy(), share.numpy()
 
 
 def multiplied(history: Tensor, gain: Tensor, lights: int) -> Tensor:
     """See models.history.light_gain.multiplied: in the same memory."""
-    rows, columns = map(arrays_between, gain.shape[-2:], history.shape[-2:])
+    rows, columns = map(arrays_between, history.shape[-2:])
     for item in range(len(history)):
         multiply_rows(history[item].numpy(), array(gain[item, 0]), lights, rows, columns)
     return history

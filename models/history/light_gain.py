@@ -29,7 +29,8 @@ def tile_sums(history: Tensor, noisy: Tensor, has_history: Tensor) -> Tensor:
     images = history[:, :3], noisy
     past, newest = (image_luminance(image).clamp(max=MAX_LUMINANCE) * has_history for image in images)
     change = newest - past
-    padded = F.pad(torch.cat([past, change, change.square()], dim=1), (0, TILE - 1, 0, TILE - 1))
+    padding = 2 * TILE - 1  # with a tile beyond the image, which no pixel uses: exports need two
+    padded = F.pad(torch.cat([past, change, change.square()], dim=1), (0, padding, 0, padding))
     return TILE**2 * F.avg_pool2d(padded, TILE)
 
 
@@ -54,7 +55,7 @@ def gain_of(sums: Tensor) -> Tensor:
 def at_pixels(tiles: Tensor, height: int, width: int) -> Tensor:
     """Tiles (B, 1, h, w), interpolated bilinearly between their centres: (B, 1, H, W)."""
     for dim, size in ((-2, height), (-1, width)):
-        before, after, share = (each.to(tiles.device) for each in between_tiles(tiles.shape[dim], size))
+        before, after, share = (each.to(tiles.device) for each in between_tiles(size))
         share = share[:, None] if dim == -2 else share
         tiles = torch.lerp(tiles.index_select(dim, before), tiles.index_select(dim, after), share)
     return tiles
