@@ -2170,8 +2170,10 @@ static int denoise(onespp *d, const onespp_frame *frame, const onespp_output *ra
     measure(&job);
     set_up_geometry(&job);
     run(&job, reproject_rows, 0, blocks_along(frame->height));
-    find_gains(&job);
-    run(&job, follow_rows, 0, frame->height);
+    if (job.has_history) {
+        find_gains(&job);
+        run(&job, follow_rows, 0, frame->height);
+    }
     run_network(&job);
     run_filter(&job);
     d->width = frame->width;

@@ -17,8 +17,6 @@ from models.operators import image_luminance
 
 OUTSIDE_ID = -1.0  # mesh id around the image
 MIN_LUMINANCE = 1e-37  # normal in float32
-# Zeros that fill up the last block of rows and columns, and one more, which shows tracers that there are two.
-BLOCK_PADDING = (0, 2 * LUMINANCE_BLOCK - 1, 0, 2 * LUMINANCE_BLOCK - 1)
 MIN_BLOCK_SHARE = LUMINANCE_BLOCK**-2 / 2  # of a block that shows a surface
 
 
@@ -112,6 +110,12 @@ def reprojected(
     return history.view(1, -1, height, width)
 
 
+def in_whole_blocks(image: Tensor, block: int) -> Tensor:
+    """With zeros that fill up the last block of rows and columns, and one more: tracers need to see two."""
+    padding = 2 * block - 1
+    return F.pad(image, (0, padding, 0, padding))
+
+
 def measured_luminance(radiance: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
     """ln(luminance / middle grey) of the surfaces, averaged over blocks, and 1, or 0 where all is black: (1,) each."""
     surface = (depth > 0).to(depth)
@@ -144,8 +148,8 @@ def updated_scale(state: Tensor, radiance: Tensor, depth: Tensor) -> tuple[Tenso
 
     The state (4,) contains the running means of both measurements and their frame counts; zeros at first.
     """
-    padded = F.pad(depth, BLOCK_PADDING)
-    luminance = measured_luminance(F.pad(radiance, BLOCK_PADDING), padded)
+    padded = in_whole_blocks(depth, LUMINANCE_BLOCK)
+    luminance = measured_luminance(in_whole_blocks(radiance, LUMINANCE_BLOCK), padded)
     new, valid = (torch.cat(both) for both in zip(luminance, measured_depth(padded, *depth.shape[-2:]), strict=True))
     mean, count = state.split(2)
     count = count + valid

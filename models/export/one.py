@@ -8,13 +8,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models import compiled
 from models.compiled.affinity import MIN_LOGIT
+from models.compiled.light_gain import TILE
 from models.compiled.one import SIDE_MULTIPLE
-from models.export.history import updated_scale
+from models.export.history import in_whole_blocks, updated_scale
 from models.export.step import Step, Warp, bounded, demodulation, image
 from models.filters.neighbours import means_of, summands
-from models.history.light_gain import follow_light
+from models.history.light_gain import at_pixels, changes, gain_of
 from models.networks.one import HISTORY, PATCH, WHOLE, Decoded, One, PixelInputs, carried, decode, input_channels
 from models.operators import MAX_IRRADIANCE, MIN_DIVISOR
 
@@ -34,6 +34,11 @@ def mesh_sums(image: Tensor, mesh: Tensor, step: int) -> Tensor:
     """See models.filters.neighbours.mesh_sums. `mesh` (1, 1, H, W) is nowhere 0."""
     values, meshes = neighbour_taps(torch.cat([image, mesh], dim=1), step).split([image.shape[1], 1], dim=1)
     return image + torch.where(meshes == mesh, values, 0).sum(dim=0, keepdim=True)
+
+
+def tile_sums(image: Tensor) -> Tensor:
+    """See models.history.light_gain.tile_sums; with one row and one column of tiles more, which no pixel uses."""
+    return TILE**2 * F.avg_pool2d(in_whole_blocks(image, TILE), TILE)
 
 
 def affinity_level(
@@ -131,8 +136,8 @@ class OneStep(Step):
         means = means_of(sums_3x3, mesh_sums(sums_3x3, mesh, 3))
         history = self.reprojected_history(x)
         has_history = (history[:, WHOLE : WHOLE + 1] > 0).to(noisy) * surface  # after the first frame, no length is 0
-        with compiled.disabled():
-            history = follow_light(history, noisy, has_history, lights=WHOLE)
+        gain = at_pixels(gain_of(tile_sums(changes(history, noisy, has_history))), *noisy.shape[-2:])
+        history = torch.cat([history[:, :WHOLE] * gain, history[:, WHOLE:]], dim=1)
         inputs = PixelInputs(noisy, *means, history, has_history)
         to_view = torch.tensor((-1.0, 1.0, -1.0))[:, None] * x["camera_to_world"][:3, :3].T  # see Frame.to_view
         normal = (to_view @ x["normal"].view(3, -1)).view_as(x["normal"])

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from models import compiled
 from models.compiled import light_gain as kernels
 from models.compiled.light_gain import TILE, between_tiles
-from models.operators import MAX_LUMINANCE, MIN_DIVISOR, image_luminance
+from models.operators import MAX_LUMINANCE, MIN_DIVISOR, block_sums, image_luminance
 
 GAIN_RADIUS = 6  # tiles
 GAIN_DEVIATION = 2.0  # tiles, of the Gaussian that weights them
@@ -19,19 +19,22 @@ GAIN_NOISE = 3.0  # standard errors of a neighbourhood's mean: smaller differenc
 MAX_GAIN = 4.0  # of history, a frame
 
 
-@compiled.by(kernels.tile_sums)
-def tile_sums(history: Tensor, noisy: Tensor, has_history: Tensor) -> Tensor:
-    """Sums (B, 3, h, w) over tiles: luminance of history, that of the frame less that of history, and its square.
+def changes(history: Tensor, noisy: Tensor, has_history: Tensor) -> Tensor:
+    """What is summed over tiles, (B, 3, H, W): luminance of history, by how much the frame's is more, and its square.
 
-    Of `noisy` irradiance (B, 3, H, W), and of the first channels of `history` (B, C, H, W); only pixels that have a
-    history (B, 1, H, W) count.
+    Of `noisy` irradiance (B, 3, H, W), and of the first channels of `history` (B, C, H, W); 0 where there is no history
+    (B, 1, H, W).
     """
     images = history[:, :3], noisy
     past, newest = (image_luminance(image).clamp(max=MAX_LUMINANCE) * has_history for image in images)
     change = newest - past
-    padding = 2 * TILE - 1  # with a tile beyond the image, which no pixel uses: exports need two
-    padded = F.pad(torch.cat([past, change, change.square()], dim=1), (0, padding, 0, padding))
-    return TILE**2 * F.avg_pool2d(padded, TILE)
+    return torch.cat([past, change, change.square()], dim=1)
+
+
+@compiled.by(kernels.tile_sums)
+def tile_sums(history: Tensor, noisy: Tensor, has_history: Tensor) -> Tensor:
+    """Sums (B, 3, h, w) of `changes` over tiles, smaller ones at the far borders."""
+    return block_sums(changes(history, noisy, has_history), TILE)
 
 
 def gain_of(sums: Tensor) -> Tensor:
