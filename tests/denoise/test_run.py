@@ -642,7 +642,7 @@ def test_layers_that_add_up_to_the_colour_do_so_denoised(tiny, tmp_path):
     clip = next(clip for clip in Dataset(tiny).clips("test") if clip.scene == "cornell_box_moving")
     export_clip(clip.path, tmp_path / "in")
     options = {"frame_range": "0-2", "stored_as": "float"}
-    lit = denoised(tmp_path / "in", tmp_path / "out", "one", aov=("direct", "indirect", "depth.Z"), **options)
+    lit = denoised(tmp_path / "in", tmp_path / "out", "one", aov=("depth.Z", "direct", "indirect"), **options)
     direct, indirect, emission = (
         images_in(tmp_path / "out", f"{name}.") for name in ("direct", "indirect", "emission")
     )
