@@ -36,9 +36,13 @@ def mesh_sums(image: Tensor, mesh: Tensor, step: int) -> Tensor:
     return image + torch.where(meshes == mesh, values, 0).sum(dim=0, keepdim=True)
 
 
-def tile_sums(image: Tensor) -> Tensor:
-    """See models.history.light_gain.tile_sums; with one row and one column of tiles more, which no pixel uses."""
-    return TILE**2 * F.avg_pool2d(in_whole_blocks(image, TILE), TILE)
+def tile_sums(history: Tensor, noisy: Tensor, has_history: Tensor) -> Tensor:
+    """See models.history.light_gain.tile_sums; with one row and one column of tiles more, which no pixel uses.
+
+    The padding comes before `changes`: onnxruntime would merge it into the pooling, which takes no such wide padding.
+    """
+    padded = in_whole_blocks(torch.cat([history[:, :3], noisy, has_history], dim=1), TILE)
+    return TILE**2 * F.avg_pool2d(changes(*padded.split([3, 3, 1], dim=1)), TILE)
 
 
 def affinity_level(
@@ -136,7 +140,7 @@ class OneStep(Step):
         means = means_of(sums_3x3, mesh_sums(sums_3x3, mesh, 3))
         history = self.reprojected_history(x)
         has_history = (history[:, WHOLE : WHOLE + 1] > 0).to(noisy) * surface  # after the first frame, no length is 0
-        gain = at_pixels(gain_of(tile_sums(changes(history, noisy, has_history))), *noisy.shape[-2:])
+        gain = at_pixels(gain_of(tile_sums(history, noisy, has_history)), *noisy.shape[-2:])
         history = torch.cat([history[:, :WHOLE] * gain, history[:, WHOLE:]], dim=1)
         inputs = PixelInputs(noisy, *means, history, has_history)
         to_view = torch.tensor((-1.0, 1.0, -1.0))[:, None] * x["camera_to_world"][:3, :3].T  # see Frame.to_view
