@@ -68,12 +68,14 @@ def precisions_of(name: str | DenoiserName) -> list[str]:
 
 
 def fastest_precision(name: str | DenoiserName, device: str = "cpu") -> str:
-    """bfloat16 for networks that support it, where the device is faster in it, else float32.
+    """bfloat16 for networks that support it, where the device is faster in it, else float32, which C computes in.
 
     Raises BadInput for an unknown name, or where there is no such device.
     """
     check_device(device)
     if not prototype(name).is_network or "bfloat16" not in precisions_of(name):
+        return "float32"
+    if device == "cpu" and unwrapped(prototype(name)).computes_in_c():
         return "float32"
     is_faster = bfloat16_is_faster() if device == "cpu" else torch.cuda.is_bf16_supported(including_emulation=False)
     return "bfloat16" if is_faster else "float32"
@@ -144,6 +146,8 @@ class DenoiserSpec:
             load_weights(unwrapped(denoiser), self.denoiser.base, self.weights)
         denoiser.prepare(PRECISIONS[self.precision])
         denoiser.device = self.device
+        if self.compiled and self.device == "cpu" and self.precision == "float32":
+            unwrapped(denoiser).use_c()
         return denoiser.to(self.device)
 
     def running(self) -> AbstractContextManager[None]:

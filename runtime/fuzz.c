@@ -88,6 +88,7 @@ static onespp_frame frame_of(Source *source, float *planes, int32_t *ids, double
         fill_pose(source, poses + 16 * i);
     frame.object_to_world = poses;
     frame.parts = (int)draw(source, PARTS + 1);
+    frame.masks = (int)draw(source, (uint32_t)frame.parts + 1);
     return frame;
 }
 
@@ -99,11 +100,17 @@ static void *allocated(size_t size)
     return memory;
 }
 
-/* A denoiser in memory that begins anywhere and is filled with NaN. */
-static onespp *created(int tasks, int max_isa, uint32_t offset, unsigned char **memory)
+static onespp_config config_of(int tasks, int max_isa)
 {
     onespp_config config = {.abi = ONESPP_ABI, .max_width = SIDE, .max_height = SIDE, .max_meshes = MESHES,
                             .tasks = tasks, .max_isa = max_isa, .max_parts = PARTS};
+    return config;
+}
+
+/* A denoiser in memory that begins anywhere and is filled with NaN. */
+static onespp *created(int tasks, int max_isa, uint32_t offset, unsigned char **memory)
+{
+    onespp_config config = config_of(tasks, max_isa);
     onespp *denoiser;
     size_t size = onespp_size(&config);
     *memory = allocated(size + offset);
@@ -123,6 +130,13 @@ static void play(Source *source)
     int max_isa = (int)draw(source, ONESPP_ISA_AVX512 + 1);
     onespp *denoisers[2] = {created(1, max_isa, draw(source, 65), &memory[0]),
                             created(5, max_isa, draw(source, 65), &memory[1])};
+    onespp_config config = config_of(1, max_isa);
+    unsigned char *blocks[2], *histories[2], *past = NULL; /* of the second, which is handed them in turn */
+    for (int i = 0; i < 2; i++) {
+        blocks[i] = allocated(onespp_history_size(&config) + 64);
+        histories[i] = blocks[i] + (64 - (uintptr_t)blocks[i] % 64) % 64;
+        memset(histories[i], 0xff, onespp_history_size(&config));
+    }
     for (int i = 0; i < FRAMES; i++) {
         onespp_frame frame = frame_of(source, planes, ids, poses);
         int pixels = frame.width * frame.height, count = 3 * pixels * (1 + frame.parts);
@@ -139,10 +153,11 @@ static void play(Source *source)
         frame.part = parts[0];
         int error = onespp_denoise(denoisers[0], &frame, &output);
         frame.part = parts[1];
-        if (onespp_denoise(denoisers[1], &frame, &again) != error)
+        if (onespp_denoise_from(denoisers[1], past, histories[i % 2], &frame, &again) != error)
             abort();
         if (error)
             continue;
+        past = histories[i % 2];
         for (int k = 0; k < count; k++)
             if (!isfinite(one[k]))
                 abort();
@@ -153,8 +168,10 @@ static void play(Source *source)
     free(one);
     free(two);
     free(ids);
-    free(memory[0]);
-    free(memory[1]);
+    for (int i = 0; i < 2; i++) {
+        free(memory[i]);
+        free(blocks[i]);
+    }
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t count);

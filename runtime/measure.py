@@ -31,8 +31,9 @@ from eval.pages import form_table
 from files import write_json
 from models.export.package import load_step
 from models.export.program import check_installed, play, run_onnx, trace, write_onnx
+from models.networks.one import One
 from models.registry import require_shipped, shipped_weights
-from models.spec import DenoiserSpec, fastest_precision
+from models.spec import DenoiserSpec, bfloat16_is_faster
 from process import keep_freed_memory
 from provenance import device_in_words
 from runtime.raw import PLANES, raw
@@ -72,8 +73,11 @@ class Form:
     in_process: bool = True  # so that its memory can be measured
 
 
-def play_library(spec: DenoiserSpec, frames: Sequence[Frame]) -> Iterator[object]:
+def play_library(spec: DenoiserSpec, in_c: bool, frames: Sequence[Frame]) -> Iterator[object]:
+    """With `in_c` as the library runs it, by C if that does the work, or else by PyTorch and Numba."""
     denoiser, state = spec.build(), None
+    if isinstance(denoiser, One) and not in_c:
+        denoiser.in_c = None
     for frame in frames:
         radiance, state = denoiser(frame, state)
         yield radiance
@@ -177,14 +181,16 @@ def onnx_form(folder: Path) -> Form:
 
 def library_forms() -> Iterator[Form]:
     megabytes = installed_mb("torch", "numba", "llvmlite")
-    for precision in dict.fromkeys((fastest_precision("one"), "float32")):
+    fast = ["bfloat16"] if bfloat16_is_faster() else []
+    forms = {"onespp": "float32"} | {f"PyTorch, {precision}": precision for precision in (*fast, "float32")}
+    for name, precision in forms.items():
         spec = DenoiserSpec.named("one", precision=precision, weights=shipped_weights("one"))
-        yield Form(f"PyTorch, {precision}", megabytes, None, partial(play_library, spec))
+        yield Form(name, megabytes, None, partial(play_library, spec, name == "onespp"))
 
 
 def oidn_forms() -> Iterator[Form]:
     for name in OIDN:
-        yield Form(name, installed_mb("pyoidn"), None, partial(play_library, DenoiserSpec.named(name)))
+        yield Form(name, installed_mb("pyoidn"), None, partial(play_library, DenoiserSpec.named(name), True))
 
 
 @torch.inference_mode()

@@ -255,7 +255,7 @@ enum {
     ACCUMULATED = OUTPUT + RGB,
     LENGTH = ACCUMULATED + RGB,
     LATENT_FROM = LENGTH + 1,
-    HISTORY = LATENT_FROM + LATENT,
+    HISTORY = LATENT_FROM + LATENT, /* ONESPP_HISTORY */
     NORMAL = HISTORY,
     TEXEL = 16
 };
@@ -342,29 +342,45 @@ typedef union {
     } leave;
 } Scratch;
 
+/* The array of all weights, in one of two forms: the other is NULL. */
+typedef struct {
+    const uint16_t *halves;
+    const float *floats;
+} Weights;
+
 /* This file, compiled for an instruction set. */
 typedef struct {
     int isa;
     uint64_t (*measure)(const onespp_config *config); /* bytes of memory */
-    onespp *(*create)(const onespp_config *config, void *memory, const uint16_t *weights);
-    int (*denoise)(onespp *d, const onespp_frame *frame, const onespp_output *radiance);
+    onespp *(*create)(const onespp_config *config, void *memory, const Weights *weights);
+    int (*denoise)(
+        onespp *d, void *past, void *next, const onespp_frame *frame, const onespp_output *radiance);
 } Engine;
 
-struct onespp {
-    const Engine *engine; /* set by the interface */
-    onespp_config config;
-    Layer layers[LAYERS];
-
-    /* What is carried from frame to frame. */
+/* What a frame leaves to the next one, but for arrays. */
+typedef struct {
     int width, height; /* 0 before the first frame */
+    int meshes, parts;
     RunningMean log_luminance, log_depth;
     double K[9], camera_to_world[16];
-    int meshes, parts;
+} Moment;
+
+/* Where all that a frame leaves is, in memory that may be copied elsewhere. */
+typedef struct {
+    Moment *moment;
     double *object_to_world;
     float *texels;
     float *part_texels; /* PART_HISTORY of each part */
     float *depth;
     int32_t *mesh;
+} History;
+
+struct onespp {
+    const Engine *engine; /* set by the interface */
+    onespp_config config;
+    Layer layers[LAYERS];
+    void *own_history;  /* of onespp_denoise */
+    History past, next; /* of the frame at work; maybe the same */
 
     /* What a frame needs. */
     ptrdiff_t pitch; /* of lines of rows, and of depth and mesh */
@@ -392,6 +408,28 @@ static void *allocate(Arena *arena, uint64_t count, size_t size)
     void *memory = arena->base ? arena->base + arena->used : NULL;
     arena->used += (count * size + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
     return memory;
+}
+
+static ptrdiff_t pitch_of(const onespp_config *config) { return PITCH(MARGIN + config->max_width + MARGIN); }
+
+static History lay_out_history(const onespp_config *config, Arena *arena)
+{
+    uint64_t pixels = (uint64_t)config->max_height * (uint64_t)pitch_of(config);
+    History history;
+    history.moment = allocate(arena, 1, sizeof(Moment));
+    history.texels = allocate(arena, pixels * TEXEL, sizeof(float));
+    history.part_texels = allocate(arena, pixels * PART_HISTORY * (uint64_t)config->max_parts, sizeof(float));
+    history.depth = allocate(arena, pixels, sizeof(float));
+    history.mesh = allocate(arena, pixels, sizeof(int32_t));
+    history.object_to_world = allocate(arena, (uint64_t)config->max_meshes * 16, sizeof(double)); /* may be longer */
+    return history;
+}
+
+static uint64_t measure_history(const onespp_config *config)
+{
+    Arena arena = {NULL, 0};
+    lay_out_history(config, &arena);
+    return arena.used;
 }
 
 static Window window(Arena *arena, int channels, int width, int rows)
@@ -448,15 +486,11 @@ static void lay_out(onespp *d, Arena *arena)
 {
     uint64_t height = (uint64_t)d->config.max_height;
     uint64_t blocks = (uint64_t)(d->config.max_width + BLOCK - 1) / BLOCK * ((height + BLOCK - 1) / BLOCK);
-    d->pitch = PITCH(MARGIN + d->config.max_width + MARGIN);
+    d->pitch = pitch_of(&d->config);
     uint64_t pixels = height * (uint64_t)d->pitch;
-    d->texels = allocate(arena, pixels * TEXEL, sizeof(float));
+    d->own_history = allocate(arena, 1, measure_history(&d->config));
     d->rows = allocate(arena, pixels * ROW_LINES, sizeof(float));
-    d->part_texels = allocate(arena, pixels * PART_HISTORY * (uint64_t)d->config.max_parts, sizeof(float));
     d->part_rows = allocate(arena, pixels * PART_LINES * (uint64_t)d->config.max_parts, sizeof(float));
-    d->depth = allocate(arena, pixels, sizeof(float));
-    d->mesh = allocate(arena, pixels, sizeof(int32_t));
-    d->object_to_world = allocate(arena, (uint64_t)d->config.max_meshes * 16, sizeof(double));
     d->motions = allocate(arena, (uint64_t)d->config.max_meshes + 1, sizeof(Motion));
     d->blocks = allocate(arena, blocks, sizeof(double));
     d->changes = allocate(arena, blocks, sizeof(Change));
@@ -473,13 +507,19 @@ static ptrdiff_t weight_index(const Layer *layer, int input, int output)
     return ((ptrdiff_t)(output / AT_ONCE) * layer->inputs + input) * AT_ONCE + output % AT_ONCE;
 }
 
+static float weight_at(const Weights *weights, ptrdiff_t index)
+{
+    return weights->halves ? float_of_half(weights->halves[index]) : weights->floats[index];
+}
+
 /* The weights of a convolution's products, from those of three rows, `row` numbers apart: see convolve. */
-static void unpack_column(const Layer *layer, float *weights, int input, int outputs, const uint16_t *from)
+static void unpack_column(
+    const Layer *layer, float *weights, int input, int outputs, const Weights *all, ptrdiff_t from)
 {
     ptrdiff_t size = (ptrdiff_t)layer->outputs * layer->inputs, row = COLUMNS * outputs;
     for (int o = 0; o < outputs; o++, from++) {
         float *to = weights + weight_index(layer, input, o);
-        float above = float_of_half(from[0]), here = float_of_half(from[row]), below = float_of_half(from[2 * row]);
+        float above = weight_at(all, from), here = weight_at(all, from + row), below = weight_at(all, from + 2 * row);
         to[0] = above;
         to[size] = (above + here + below) / 2;
         to[2 * size] = (above - here + below) / 2;
@@ -487,21 +527,21 @@ static void unpack_column(const Layer *layer, float *weights, int input, int out
     }
 }
 
-/* Reads a layer from the array of all weights: biases, then a matrix (inputs, outputs), where those of a convolution
- * are in the order of channels, rows, columns. Returns what follows it. */
-static const uint16_t *unpack(Layer *layer, int name, float *to, const uint16_t *from)
+/* Reads a layer from index `from` on: biases, then a matrix (inputs, outputs), where those of a convolution are in the
+ * order of channels, rows, columns. Returns the index of what follows it. */
+static ptrdiff_t unpack(Layer *layer, int name, float *to, const Weights *all, ptrdiff_t from)
 {
     int outputs = LAYER_SIZES[name][0], inputs = LAYER_SIZES[name][1];
     float *weights = to + layer->outputs;
     memset(to, 0, sizeof(float) * (size_t)parameters_of(layer, name));
     for (int o = 0; o < outputs; o++)
-        to[o] = float_of_half(*from++);
+        to[o] = weight_at(all, from++);
     for (int i = 0; i < layer->inputs; i++)
         if (is_convolution(name))
-            unpack_column(layer, weights, i, outputs, from + (i / COLUMNS * TAPS + i % COLUMNS) * outputs);
+            unpack_column(layer, weights, i, outputs, all, from + (i / COLUMNS * TAPS + i % COLUMNS) * outputs);
         else
             for (int o = 0; o < outputs; o++)
-                weights[weight_index(layer, i, o)] = float_of_half(from[i * outputs + o]);
+                weights[weight_index(layer, i, o)] = weight_at(all, from + i * outputs + o);
     layer->bias = to;
     layer->weights = weights;
     return from + (ptrdiff_t)inputs * outputs;
@@ -727,15 +767,20 @@ static double log_depth(const onespp *d, const onespp_frame *frame)
     return count ? log((double)median(d->depths, count)) : NAN;
 }
 
+/* The exposure and the unit of length, from means over all frames of the sequence: both begin anew without history. */
 static void measure(Job *job)
 {
     onespp *d = job->d;
+    Moment *next = d->next.moment;
+    RunningMean no_luminance = {logf(MIDDLE_GREY), 0}, no_depth = {0, 0};
     int columns = blocks_along(job->frame.width), rows = blocks_along(job->frame.height);
     run(job, measure_rows, 0, rows);
-    update(&d->log_luminance, log_luminance(d->blocks, columns * rows));
-    update(&d->log_depth, log_depth(d, &job->frame));
-    job->exposure = clamped(MIDDLE_GREY * expf(-d->log_luminance.value), MAX_MAGNITUDE);
-    job->depth_scale = clamped(expf(d->log_depth.value), MAX_MAGNITUDE);
+    next->log_luminance = job->has_history ? d->past.moment->log_luminance : no_luminance;
+    next->log_depth = job->has_history ? d->past.moment->log_depth : no_depth;
+    update(&next->log_luminance, log_luminance(d->blocks, columns * rows));
+    update(&next->log_depth, log_depth(d, &job->frame));
+    job->exposure = clamped(MIDDLE_GREY * expf(-next->log_luminance.value), MAX_MAGNITUDE);
+    job->depth_scale = clamped(expf(next->log_depth.value), MAX_MAGNITUDE);
 }
 
 /* --- Geometry ----------------------------------------------------------------------------------------------------- */
@@ -769,7 +814,7 @@ static void invert_pose(double out[16], const double pose[16])
  * are in double, and the eye is subtracted before rounding: scenes far from the origin keep their precision. */
 static Motion motion_of(const Job *job, const double *before, const double *now)
 {
-    const double *pose = job->frame.camera_to_world, *eye = job->d->camera_to_world;
+    const double *pose = job->frame.camera_to_world, *eye = job->d->past.moment->camera_to_world;
     double moved[16];
     Motion motion;
     memcpy(moved, pose, sizeof moved);
@@ -795,25 +840,27 @@ static void set_up_geometry(Job *job)
 {
     onespp *d = job->d;
     const onespp_frame *frame = &job->frame;
-    const double *pose = frame->camera_to_world, *eye = d->camera_to_world;
+    const double *pose = frame->camera_to_world;
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
             job->to_view[i][j] = (float)(i == 1 ? pose[4 * j + i] : -pose[4 * j + i]);
     if (!job->has_history)
         return;
+    const Moment *past = d->past.moment;
+    const double *eye = past->camera_to_world;
     for (int i = 0; i < 2; i++) {
         job->slopes[i] = (float)(1 / frame->K[4 * i]);
         job->origin[i] = (float)(-frame->K[3 * i + 2] / frame->K[4 * i]);
     }
     for (int i = 0; i < 3; i++) {
-        double x = eye[4 * i] / d->K[0], y = eye[4 * i + 1] / d->K[4];
+        double x = eye[4 * i] / past->K[0], y = eye[4 * i + 1] / past->K[4];
         job->axes[0][i] = (float)x;
         job->axes[1][i] = (float)y;
-        job->axes[2][i] = (float)(eye[4 * i + 2] - x * d->K[2] - y * d->K[5]);
+        job->axes[2][i] = (float)(eye[4 * i + 2] - x * past->K[2] - y * past->K[5]);
     }
     d->motions[0] = motion_of(job, NULL, NULL);
     for (int i = 0; i < frame->meshes; i++) {
-        const double *before = i < d->meshes ? d->object_to_world + 16 * i : NULL; /* new meshes stand still */
+        const double *before = i < past->meshes ? d->past.object_to_world + 16 * i : NULL; /* new meshes stand still */
         d->motions[i + 1] = motion_of(job, before, before ? frame->object_to_world + 16 * i : NULL);
     }
 }
@@ -889,15 +936,15 @@ static Surface surface_before(const Job *job, int x, int y, float depth, const f
 /* Whether pixel (x, y) of the previous frame shows the surface. */
 static inline int is_consistent(const Job *job, const Surface *surface, int x, int y)
 {
-    const onespp *d = job->d;
-    ptrdiff_t pixel = (ptrdiff_t)y * d->pitch + x;
-    if (x < 0 || y < 0 || x >= d->width || y >= d->height || d->mesh[pixel] != surface->mesh)
+    const History *past = &job->d->past;
+    ptrdiff_t pixel = (ptrdiff_t)y * job->d->pitch + x;
+    if (x < 0 || y < 0 || x >= past->moment->width || y >= past->moment->height || past->mesh[pixel] != surface->mesh)
         return 0;
     if (surface->mesh == BACKGROUND)
         return 1;
-    const float *normal = d->texels + pixel * TEXEL + NORMAL;
+    const float *normal = past->texels + pixel * TEXEL + NORMAL;
     float px = (float)x + 0.5f, py = (float)y + 0.5f;
-    float depth = d->depth[pixel], off_plane = 0, cosine = 0;
+    float depth = past->depth[pixel], off_plane = 0, cosine = 0;
     for (int i = 0; i < 3; i++) {
         float visible = depth * (job->axes[0][i] * px + job->axes[1][i] * py + job->axes[2][i]);
         off_plane += (surface->point[i] - visible) * normal[i];
@@ -911,8 +958,8 @@ static inline void add_texel(
 {
     ptrdiff_t pixel = (ptrdiff_t)y * job->d->pitch + x;
     int of_parts = PART_HISTORY * job->frame.parts;
-    const float *restrict texel = job->d->texels + pixel * TEXEL;
-    const float *restrict parts = job->d->part_texels + pixel * of_parts;
+    const float *restrict texel = job->d->past.texels + pixel * TEXEL;
+    const float *restrict parts = job->d->past.part_texels + pixel * of_parts;
     for (int c = 0; c < TEXEL; c++)
         sum[c] += weight * texel[c];
     for (int c = 0; c < of_parts; c++)
@@ -984,8 +1031,8 @@ static void reproject(
         memset(of_part, 0, sizeof(float) * (size_t)of_parts);
         if (depth[i] > 0) {
             /* Far outside the image an index would overflow; any place outside is as good. */
-            float x = maxf(minf((float)(x0 + i) + motion[0][i], (float)job->d->width + 1), -2);
-            float y_then = maxf(minf((float)y + motion[1][i], (float)job->d->height + 1), -2);
+            float x = maxf(minf((float)(x0 + i) + motion[0][i], (float)job->frame.width + 1), -2);
+            float y_then = maxf(minf((float)y + motion[1][i], (float)job->frame.height + 1), -2);
             float n_here[3] = {normal[0][i], normal[1][i], normal[2][i]};
             Surface surface = surface_before(job, x0 + i, y, depth[i], n_here, mesh[i]);
             fetch(job, &surface, x, y_then, texels[i], of_part);
@@ -1115,7 +1162,7 @@ static void follow_light(const Job *job, int y, int x0, int n)
         for (int i = 0; i < n; i++)
             line[i] *= gain[i];
     }
-    for (int c = 0; c < PART_HISTORY * job->frame.parts; c++) {
+    for (int c = 0; c < PART_HISTORY * (job->frame.parts - job->frame.masks); c++) {
         float *restrict line = part_line(d, y, c / PART_HISTORY, c % PART_HISTORY) + x0;
         for (int i = 0; i < n; i++)
             line[i] *= gain[i];
@@ -1804,7 +1851,7 @@ static float *filtered_line(const onespp *d, int pass, int y, int channel)
         return part_line(d, y, of_part / RGB, PART_FILTERED + RGB * turn + of_part % RGB);
     if (pass == PASSES - 2)
         return row_line(d, y, LEVEL_LINES + channel);
-    return d->texels + ((ptrdiff_t)y * TEXEL + FILTERED * turn + channel) * d->pitch + MARGIN;
+    return d->next.texels + ((ptrdiff_t)y * TEXEL + FILTERED * turn + channel) * d->pitch + MARGIN;
 }
 
 static int filtered_channels(const Job *job) { return FILTERED + RGB * job->frame.parts; }
@@ -2009,15 +2056,15 @@ static void remember(const Job *job, int y, int x0, int n)
         load_normal(normal[c], &job->frame, c, y, x0, n);
         lines[NORMAL + c] = normal[c];
     }
-    join_texels(d->texels + pixel * TEXEL, lines, n);
+    join_texels(d->next.texels + pixel * TEXEL, lines, n);
     int of_parts = PART_HISTORY * job->frame.parts;
     for (int c = 0; c < of_parts; c++) {
         const float *line = part_line(d, y, c / PART_HISTORY, c % PART_HISTORY) + x0;
         for (int i = 0; i < n; i++)
-            d->part_texels[(pixel + i) * of_parts + c] = line[i];
+            d->next.part_texels[(pixel + i) * of_parts + c] = line[i];
     }
-    load(d->depth + pixel, &job->frame.depth, 0, y, x0, n);
-    load_mesh(d->mesh + pixel, &job->frame, y, x0, n);
+    load(d->next.depth + pixel, &job->frame.depth, 0, y, x0, n);
+    load_mesh(d->next.mesh + pixel, &job->frame, y, x0, n);
 }
 
 /* A colour of a part of the light, blended and written: where no surface is, it stays as it is. */
@@ -2099,20 +2146,22 @@ static uint64_t measure_memory(const onespp_config *config)
     return arena.used + ALIGNMENT; /* the caller's memory may begin anywhere */
 }
 
-static onespp *create(const onespp_config *config, void *memory, const uint16_t *weights)
+static onespp *create(const onespp_config *config, void *memory, const Weights *weights)
 {
     unsigned char *base = memory;
     Arena arena = {base + (ALIGNMENT - (uintptr_t)base % ALIGNMENT) % ALIGNMENT, 0};
     onespp *d = allocate(&arena, 1, sizeof(onespp));
-    memset(d, 0, sizeof *d); /* there is no previous frame, whatever the memory held */
     d->config = *config;
     lay_out(d, &arena);
+    /* There is no previous frame, whatever the memory held. */
+    memset(d->own_history, 0, sizeof(Moment));
     memset(d->zeros, 0, sizeof(float) * (size_t)d->a.pitch);
     for (ptrdiff_t i = 0; i < d->pitch; i++)
         d->ones[i] = 1;
     float *to = d->parameters;
+    ptrdiff_t from = 0;
     for (int i = 0; i < LAYERS; i++) {
-        weights = unpack(&d->layers[i], i, to, weights);
+        from = unpack(&d->layers[i], i, to, weights, from);
         to += parameters_of(&d->layers[i], i);
     }
     return d;
@@ -2124,7 +2173,8 @@ static int check(const onespp *d, const onespp_frame *frame, const onespp_output
         && frame->height <= d->config.max_height && frame->meshes >= 0 && frame->meshes <= d->config.max_meshes;
     int complete = frame->direct.data && frame->albedo.data && frame->normal.data && frame->depth.data
         && frame->motion.data && radiance->data && (frame->meshes == 0 || frame->object_to_world);
-    complete = complete && frame->parts >= 0 && frame->parts <= d->config.max_parts && (frame->parts == 0 || frame->part);
+    complete = complete && frame->parts >= 0 && frame->parts <= d->config.max_parts && (frame->parts == 0 || frame->part)
+        && frame->masks >= 0 && frame->masks <= frame->parts;
     for (int i = 0; complete && i < frame->parts; i++)
         complete = frame->part[i].noisy.data && frame->part[i].radiance.data;
     if (!fits || !complete || !(frame->samples >= ONESPP_MIN_SAMPLES && frame->samples <= ONESPP_MAX_SAMPLES))
@@ -2143,30 +2193,43 @@ static void set_default(onespp_image *image, const float *value)
         *image = constant;
 }
 
-/* Forgets everything before this frame. */
-static void reset(onespp *d)
+/* Keeps what the next frame needs to know of this one, beside its images. */
+static void remember_moment(const onespp *d, const onespp_frame *frame)
 {
-    RunningMean luminance = {logf(MIDDLE_GREY), 0}, depth = {0, 0};
-    d->log_luminance = luminance;
-    d->log_depth = depth;
+    Moment *moment = d->next.moment;
+    moment->width = frame->width;
+    moment->height = frame->height;
+    moment->meshes = frame->meshes;
+    moment->parts = frame->parts;
+    memcpy(moment->K, frame->K, sizeof moment->K);
+    memcpy(moment->camera_to_world, frame->camera_to_world, sizeof moment->camera_to_world);
+    if (frame->meshes)
+        memcpy(d->next.object_to_world, frame->object_to_world, sizeof(double) * 16 * (size_t)frame->meshes);
 }
 
-static int denoise(onespp *d, const onespp_frame *frame, const onespp_output *radiance)
+/* Whether the frame continues the sequence that the past is of. */
+static int continues(const onespp_frame *frame, const Moment *past)
+{
+    return past && !frame->reset && frame->width == past->width && frame->height == past->height
+        && frame->parts == past->parts;
+}
+
+static int denoise(onespp *d, void *past, void *next, const onespp_frame *frame, const onespp_output *radiance)
 {
     static const float zero = 0, one = 1;
     int error = check(d, frame, radiance);
     if (error)
         return error;
+    Arena past_arena = {past, 0}, next_arena = {next, 0};
+    d->past = lay_out_history(&d->config, &past_arena);
+    d->next = lay_out_history(&d->config, &next_arena);
     Job job = {.d = d, .frame = *frame, .radiance = *radiance};
     job.padded_width = rounded_up(frame->width, 8);
     job.padded_height = rounded_up(frame->height, 8);
-    job.has_history = !frame->reset && frame->width == d->width && frame->height == d->height
-        && frame->parts == d->parts;
+    job.has_history = continues(frame, d->past.moment);
     set_default(&job.frame.indirect, &zero);
     set_default(&job.frame.emission, &zero);
     set_default(&job.frame.roughness, &one);
-    if (!job.has_history)
-        reset(d);
     measure(&job);
     set_up_geometry(&job);
     run(&job, reproject_rows, 0, blocks_along(frame->height));
@@ -2176,14 +2239,7 @@ static int denoise(onespp *d, const onespp_frame *frame, const onespp_output *ra
     }
     run_network(&job);
     run_filter(&job);
-    d->width = frame->width;
-    d->height = frame->height;
-    d->meshes = frame->meshes;
-    d->parts = frame->parts;
-    memcpy(d->K, frame->K, sizeof d->K);
-    memcpy(d->camera_to_world, frame->camera_to_world, sizeof d->camera_to_world);
-    if (frame->meshes)
-        memcpy(d->object_to_world, frame->object_to_world, sizeof(double) * 16 * (size_t)frame->meshes);
+    remember_moment(d, frame);
     return ONESPP_OK;
 }
 
@@ -2260,15 +2316,21 @@ static int is_valid(const onespp_config *config)
         && config->max_isa <= ONESPP_ISA_AVX512 && config->max_parts >= 0 && config->max_parts <= ONESPP_MAX_PARTS;
 }
 
+static size_t checked_size(uint64_t size) { return size <= SIZE_MAX / 2 ? (size_t)size : 0; }
+
 size_t onespp_size(const onespp_config *config)
 {
     if (config->abi != ONESPP_ABI || !is_valid(config))
         return 0;
-    uint64_t size = engine_of(config)->measure(config);
-    return size <= SIZE_MAX / 2 ? (size_t)size : 0;
+    return checked_size(engine_of(config)->measure(config));
 }
 
-int onespp_create(const onespp_config *config, void *memory, size_t size, onespp **denoiser)
+size_t onespp_history_size(const onespp_config *config)
+{
+    return onespp_size(config) ? checked_size(measure_history(config)) : 0;
+}
+
+static int create_with(const onespp_config *config, void *memory, size_t size, const Weights *weights, onespp **denoiser)
 {
     if (config->abi != ONESPP_ABI)
         return ONESPP_BAD_ABI;
@@ -2278,14 +2340,49 @@ int onespp_create(const onespp_config *config, void *memory, size_t size, onespp
     if (!memory || size < needed)
         return ONESPP_BAD_MEMORY;
     const Engine *engine = engine_of(config);
-    *denoiser = engine->create(config, memory, onespp_weights);
+    *denoiser = engine->create(config, memory, weights);
     (*denoiser)->engine = engine;
     return ONESPP_OK;
 }
 
+int onespp_create(const onespp_config *config, void *memory, size_t size, onespp **denoiser)
+{
+    Weights weights = {onespp_weights, NULL};
+    return create_with(config, memory, size, &weights, denoiser);
+}
+
+int onespp_create_with(
+    const onespp_config *config, void *memory, size_t size, const float *weights, size_t count, onespp **denoiser)
+{
+    Weights given = {NULL, weights};
+    if (!weights || count != sizeof onespp_weights / sizeof *onespp_weights)
+        return ONESPP_BAD_CONFIG;
+    return create_with(config, memory, size, &given, denoiser);
+}
+
 int onespp_denoise(onespp *denoiser, const onespp_frame *frame, const onespp_output *radiance)
 {
-    return denoiser->engine->denoise(denoiser, frame, radiance);
+    void *history = denoiser->own_history;
+    return denoiser->engine->denoise(denoiser, history, history, frame, radiance);
+}
+
+int onespp_denoise_from(
+    onespp *denoiser, const void *past, void *next, const onespp_frame *frame, const onespp_output *radiance)
+{
+    if (!next || (uintptr_t)past % ALIGNMENT || (uintptr_t)next % ALIGNMENT)
+        return ONESPP_BAD_MEMORY;
+    return denoiser->engine->denoise(denoiser, (void *)(uintptr_t)past, next, frame, radiance);
+}
+
+void onespp_read_history(const onespp *denoiser, const void *history, const onespp_output *to)
+{
+    Arena arena = {(void *)(uintptr_t)history, 0};
+    History past = lay_out_history(&denoiser->config, &arena);
+    for (int y = 0; y < past.moment->height; y++)
+        for (int x = 0; x < past.moment->width; x++)
+            for (int c = 0; c < ONESPP_HISTORY; c++)
+                to->data[to->channel * c + to->row * y + to->column * x]
+                    = past.texels[((ptrdiff_t)y * denoiser->pitch + x) * TEXEL + c];
 }
 
 #endif

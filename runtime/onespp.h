@@ -16,7 +16,7 @@
 extern "C" {
 #endif
 
-#define ONESPP_ABI 3 /* changes whenever a program has to be compiled anew */
+#define ONESPP_ABI 4 /* changes whenever a program has to be compiled anew */
 
 enum {
     ONESPP_OK = 0,
@@ -31,6 +31,7 @@ enum {
 #define ONESPP_MAX_MESHES 65536 /* that move */
 #define ONESPP_MAX_TASKS 1024
 #define ONESPP_MAX_PARTS 16 /* of the light */
+#define ONESPP_HISTORY 13   /* channels of a history */
 #define ONESPP_MIN_SAMPLES 1e-3f
 #define ONESPP_MAX_SAMPLES 1e9f
 
@@ -60,8 +61,8 @@ typedef struct {
 } onespp_ids;
 
 /* A part of the light, such as that of one lamp: it is denoised by the kernels that are chosen for the whole, so parts
- * whose noisy radiance adds up to `direct` plus `indirect` do so denoised. Its past is scaled by changes of the whole, so
- * it must be light: a mask would not stay between 0 and 1. Background stays as it is. */
+ * whose noisy radiance adds up to `direct` plus `indirect` do so denoised. Its past is scaled by changes of the whole;
+ * that of a mask is not, which stays between 0 and 1. Background stays as it is. */
 typedef struct {
     onespp_image noisy;     /* 3 channels of radiance, of either sign */
     onespp_output radiance; /* 3; may be the noisy image itself, and overlap no other input */
@@ -98,6 +99,7 @@ typedef struct {
 
     int parts; /* at most max_parts; another number than before resets */
     const onespp_part *part;
+    int masks; /* how many parts, the last ones, are no light but masks: their past is not scaled */
 } onespp_frame;
 
 /* Calls task(argument, i) once for each i from 0 to count - 1, in any order and on any threads, and returns when all
@@ -127,9 +129,31 @@ size_t onespp_size(const onespp_config *config);
 /* Sets *denoiser up in `size` bytes of `memory`, which it uses until the caller frees or reuses them. */
 int onespp_create(const onespp_config *config, void *memory, size_t size, onespp **denoiser);
 
+/* The same with other weights than those compiled in: `count` of them, in the order of onespp_weights.h. */
+int onespp_create_with(
+    const onespp_config *config, void *memory, size_t size, const float *weights, size_t count, onespp **denoiser);
+
 /* Denoises one frame: writes 3 channels of radiance. The result does not depend on tasks and threads. The output may
  * overlap no input. After an error nothing was written, and the state is what it was. */
 int onespp_denoise(onespp *denoiser, const onespp_frame *frame, const onespp_output *radiance);
+
+/* --- Histories as values ---
+ *
+ * A denoiser keeps the history of one sequence by itself. With the following calls it serves several, such as the views
+ * of a scene, and can go back to an earlier frame: what a frame leaves is in the caller's memory, which may be copied. */
+
+/* How many bytes a history takes; 0 where the configuration is not valid. */
+size_t onespp_history_size(const onespp_config *config);
+
+/* onespp_denoise for a frame that follows the history `past`, or none where that is NULL. Its own is written to `next`,
+ * which may be `past`. Both begin at multiples of 64 bytes, else ONESPP_BAD_MEMORY; a history fits denoisers of the same
+ * sizes and parts. */
+int onespp_denoise_from(
+    onespp *denoiser, const void *past, void *next, const onespp_frame *frame, const onespp_output *radiance);
+
+/* Writes ONESPP_HISTORY channels of a history: denoised and accumulated irradiance (3 each), the latter's effective
+ * length in samples, and 6 that the network carries. */
+void onespp_read_history(const onespp *denoiser, const void *history, const onespp_output *to);
 
 /* The instruction set that it uses. */
 int onespp_isa(const onespp *denoiser);

@@ -46,6 +46,7 @@ def kernels() -> None:
     names = [name for name in (*DENOISERS, "eaw+adaptive", "svgf+js") if not prototype(name).unavailable()]
     for name in names if worker == "gw0" else reversed(names):
         compile_kernels(DenoiserSpec.named(name))
+    compile_kernels(DenoiserSpec.named("one", precision="bfloat16"))  # kernels: in float32 C does their work
     all_compiled.touch()
 
 

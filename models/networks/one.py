@@ -12,6 +12,7 @@ from datasets.frame import Frame, Signal, times_each
 from models import compiled
 from models.compiled import affinity as affinity_kernels
 from models.compiled import one as kernels
+from models.compiled import one_in_c
 from models.compiled.affinity import MIN_LOGIT
 from models.compiled.one import (
     DARKEST,
@@ -28,6 +29,7 @@ from models.compiled.one import (
     SIDE_MULTIPLE,
     SPREADING_PASSES,
 )
+from models.compiled.one_in_c import OneInC, StateInC
 from models.denoiser import NO_FLOAT16, Denoiser, State, matching_state
 from models.filters.neighbours import mesh_means, taps_3x3
 from models.history.geometry import GBuffer
@@ -349,6 +351,7 @@ class One(Denoiser):
     is_network = True
     inputs = INPUT_CHANNELS
     widths: ClassVar[tuple[int, int, int]] = (40, 56, 64)
+    in_c: OneInC | None = None  # what computes in its place where it can, see use_c
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
@@ -415,7 +418,16 @@ class One(Denoiser):
         head = self.network(patches.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
         return Decoded(*decode_head(head.to(inputs.noisy), hidden, last, inputs, frame.samples.to(inputs.noisy)))
 
+    def computes_in_c(self) -> bool:
+        return self.widths == One.widths and one_in_c.is_available()
+
+    def use_c(self) -> None:
+        if self.computes_in_c():
+            self.in_c = OneInC(self.network.state_dict())
+
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        if self.in_c and compiled.enabled and self.in_c.takes(frame):
+            return self.in_c.denoise(frame, state, self.signal)
         irradiance, after = self.predict(frame, state)
         return frame.remodulate(irradiance, self.signal), after
 
@@ -424,6 +436,9 @@ class One(Denoiser):
 
         Kernels and weights of history are those of the whole, so parts that add up to the noisy light do so denoised.
         """
-        assert isinstance(state, OneState) and frame.parts is not None
+        assert isinstance(state, OneState | StateInC) and frame.parts is not None
+        if isinstance(state, StateInC):
+            assert state.parts is not None
+            return state.parts
         reflected = times_each(state.part_output, frame.divisor)
         return reflected if frame.surface is None else torch.where(frame.surface > 0, reflected, frame.parts)

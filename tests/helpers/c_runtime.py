@@ -23,7 +23,7 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror")
 OPTIMISED = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-DONESPP_DISPATCH")
 SOURCES = tuple(FOLDER / name for name in ("onespp.c", "onespp_avx2.c", "onespp_avx512.c"))
 CC = which("cc") or which("gcc") or which("clang") or ""
-ABI = 3
+ABI = 4
 ISAS = {"any": 0, "baseline": 1, "avx2": 2, "avx512": 3}
 
 Task = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int)
@@ -74,6 +74,7 @@ class CFrame(ctypes.Structure):
         ("object_to_world", ctypes.c_void_p),
         ("parts", ctypes.c_int),
         ("part", ctypes.POINTER(Part)),
+        ("masks", ctypes.c_int),
     )
 
 
@@ -88,6 +89,7 @@ def build(target: Path, files: Sequence[Path], flags: Sequence[str] = OPTIMISED)
     subprocess.run([CC, *STRICT, *flags, "-fPIC", "-shared", *files, "-o", target, "-lm"], check=True)
     library = Library(str(target))
     library.onespp_size.restype = ctypes.c_size_t
+    library.onespp_history_size.restype = ctypes.c_size_t
     library.onespp_message.restype = ctypes.c_char_p
     return library
 
@@ -133,11 +135,21 @@ class CRuntime:
     def isa(self) -> int:
         return self.library.onespp_isa(self.denoiser)
 
-    def call(self, frame: CFrame, output: Image) -> int:
-        return self.library.onespp_denoise(self.denoiser, ctypes.byref(frame), ctypes.byref(output))
+    def call(self, frame: CFrame, output: Image, histories: Sequence[ctypes.c_void_p | None] = ()) -> int:
+        images = ctypes.byref(frame), ctypes.byref(output)
+        if histories:
+            return self.library.onespp_denoise_from(self.denoiser, *histories, *images)
+        return self.library.onespp_denoise(self.denoiser, *images)
 
-    def __call__(self, frame: Frame, reset: bool, interleaved: bool = False, without: Sequence[str] = ()) -> Tensor:
-        """Radiance (1, 3, H, W)."""
+    def __call__(
+        self,
+        frame: Frame,
+        reset: bool,
+        interleaved: bool = False,
+        without: Sequence[str] = (),
+        histories: Sequence[ctypes.c_void_p | None] = (),
+    ) -> Tensor:
+        """Radiance (1, 3, H, W); by default with the denoiser's own history."""
         height, width = frame.size
         arrays: dict[str, Any] = {}
         given = CFrame(width=width, height=height, reset=reset, samples=frame.samples.item())
@@ -154,6 +166,7 @@ class CRuntime:
         given.K[:] = frame.now.K[0].flatten().tolist()
         given.camera_to_world[:] = frame.now.camera_to_world[0].flatten().tolist()
         given.meshes, given.object_to_world = len(poses), address(poses)
+        given.masks = frame.masks
         given.parts = 0 if frame.parts is None else frame.parts.shape[1] // 3
         parts = np.empty((0, height, width), np.float32)
         if frame.parts is not None:  # which are denoised in place
@@ -161,7 +174,7 @@ class CRuntime:
             images = [strided(part, False) for part in np.split(parts, given.parts)]
             given.part = (Part * given.parts)(*(Part(image, image) for image in images))
         output = np.full((height, width, 3) if interleaved else (3, height, width), np.nan, np.float32)
-        assert self.call(given, strided(output, interleaved)) == 0
+        assert self.call(given, strided(output, interleaved), histories) == 0
         self.parts = torch.from_numpy(parts)[None]
         return torch.from_numpy(np.moveaxis(output, -1, 0).copy() if interleaved else output)[None]
 

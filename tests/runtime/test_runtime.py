@@ -18,8 +18,9 @@ from torch import Tensor
 from datasets.clip import Dataset
 from datasets.frame import BOUNDED, Frame, read_frame
 from eval.bench.synthetic_frames import synthetic_frame
+from models.compiled.one_in_c import in_order
 from models.denoiser import State
-from models.networks.one import One
+from models.networks.one import HISTORY, One
 from models.registry import require_shipped
 from runtime.raw import write_raw
 from runtime.weights import HEADER, header
@@ -40,6 +41,7 @@ from tests.helpers.c_runtime import (
     address,
     build,
     rounded_one,
+    strided,
 )
 from tests.helpers.frames import MESHES, chain, flat_frame
 
@@ -47,6 +49,9 @@ TOLERANCE = 1e-4  # of the brightest pixel
 SIZE = (40, 56)
 ISA_TOLERANCE = 1e-5
 STRIPS = "-DONESPP_STRIP_PIXELS=1"  # of 64 rows
+
+INTERFACE = {"onespp_history_size", "onespp_denoise_from", "onespp_read_history", "onespp_create_with"}
+INTERFACE |= {f"onespp_{name}" for name in ("abi", "size", "create", "denoise", "isa", "message")}
 
 pytestmark = pytest.mark.skipif(not CC, reason="there is no C compiler")
 
@@ -125,8 +130,7 @@ def test_it_neither_allocates_nor_has_global_state(file, objects):
     symbols = [[cell.strip() for cell in line.split("|")] for line in table.splitlines() if line.count("|") == 6]
     sections = {row[6] for row in symbols} - {"Section", "*UND*"}
     assert sections and all(section.startswith((".text", ".rodata", ".data.rel.ro")) for section in sections)
-    functions = {f"onespp_{name}" for name in ("abi", "size", "create", "denoise", "isa", "message")}
-    assert {name for name, _, kind, *_ in symbols if kind == "T"} == (functions if file == "onespp.c" else set())
+    assert {name for name, _, kind, *_ in symbols if kind == "T"} == (INTERFACE if file == "onespp.c" else set())
     needed = {name for name, _, kind, *_ in symbols if kind == "U"}
     engines = {"onespp_avx2", "onespp_avx512"}
     of_the_compiler = {"__cpu_model", "_GLOBAL_OFFSET_TABLE_"}
@@ -140,7 +144,7 @@ def test_a_shared_library_exports_the_interface_alone(library):
     command = ["nm", "--dynamic", "--defined-only", "--format=posix", library._name]
     lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
     names = {line.split()[0] for line in lines} - {"_init", "_fini"}
-    assert names == {f"onespp_{name}" for name in ("abi", "size", "create", "denoise", "isa", "message")}
+    assert names == INTERFACE
 
 
 def test_instruction_sets_differ_by_rounding(library, one, frames, monkeypatch):
@@ -191,6 +195,7 @@ def in_parts(frame: Frame, count: int) -> Frame:
 def test_parts_of_the_light(limited, one, size):
     frames = [in_parts(frame, count) for frame, count in zip(synthetic(5, size), (2, 2, 3, 3, 1), strict=True)]
     compare(limited, one, frames)
+    compare(limited, one, [replace(frame, masks=1) for frame in frames])
     runtime = CRuntime(limited, size[1], size[0], parts=3)
     for frame in frames:
         whole = runtime(frame, reset=False) - frame.emission
@@ -310,6 +315,64 @@ def test_threads_change_nothing(limited):
         assert torch.equal(run(tasks, threads), alone)
 
 
+def aligned(size: int) -> np.ndarray:
+    """Memory that begins where histories may."""
+    memory = np.full(size + 64, 0xFF, np.uint8)
+    return memory[-memory.ctypes.data % 64 :][:size]
+
+
+def test_histories_are_values(limited):
+    """Frames that go on from an earlier history, or a copy of it, equal those of a denoiser that played them all."""
+    size, frames = (41, 70), synthetic(4, (41, 70))
+    played, other = (CRuntime(limited, size[1], size[0], meshes=count) for count in (64, 100))
+    expected = [played(frame, index == 0) for index, frame in enumerate(frames)]
+    count = max(limited.onespp_history_size(ctypes.byref(runtime.config)) for runtime in (played, other))
+    histories: list[np.ndarray] = []
+    for index, frame in enumerate(frames):
+        histories.append(aligned(count))
+        past = address(histories[index - 1]) if index else None
+        assert torch.equal(other(frame, reset=False, histories=(past, address(histories[index]))), expected[index])
+    again, copy = aligned(count), aligned(count)
+    copy[:] = histories[1]
+    assert torch.equal(played(frames[2], reset=False, histories=(address(copy), address(again))), expected[2])
+    assert torch.equal(other(frames[3], reset=False, histories=(address(again), address(again))), expected[3])
+    assert torch.equal(played(frames[3], reset=False, histories=(address(histories[2]), address(copy))), expected[3])
+
+
+def test_a_history_is_read_as_images(limited, one, frames):
+    runtime, state = CRuntime(limited, SIZE[1], SIZE[0]), None
+    memory = aligned(limited.onespp_history_size(ctypes.byref(runtime.config)))
+    for index, frame in enumerate(frames):
+        runtime(frame, reset=False, histories=(address(memory) if index else None, address(memory)))
+        with torch.no_grad():
+            _, state = one(frame, state)
+    images = np.full((sum(HISTORY), *SIZE), np.nan, np.float32)
+    limited.onespp_read_history(runtime.denoiser, address(memory), ctypes.byref(strided(images, interleaved=False)))
+    expected = torch.cat([state.output, state.accumulated, state.length, state.latent], dim=1)[0]
+    torch.testing.assert_close(torch.from_numpy(images), expected, rtol=1e-3, atol=1e-3)
+
+
+def test_histories_begin_at_multiples_of_64_bytes(limited, frames):
+    runtime = CRuntime(limited, SIZE[1], SIZE[0])
+    memory = aligned(limited.onespp_history_size(ctypes.byref(runtime.config)) + 64)
+    for past, after in ((None, None), (None, address(memory[4:])), (address(memory[4:]), address(memory))):
+        arguments = [runtime.denoiser, past, after, ctypes.byref(CFrame()), ctypes.byref(Image())]
+        assert limited.onespp_denoise_from(*arguments) == 3
+
+
+def test_other_weights_than_those_compiled_in(limited, one, frames):
+    """Handed over as floats: those of half precision give the same bits."""
+    runtime = CRuntime(limited, SIZE[1], SIZE[0])
+    weights = in_order({name: tensor.numpy() for name, tensor in one.network.state_dict().items()})
+    arguments = [ctypes.byref(runtime.config), address(runtime.memory), ctypes.c_size_t(runtime.size)]
+    expected = [runtime(frame, index == 0) for index, frame in enumerate(frames)]
+    made = ctypes.byref(runtime.denoiser)
+    assert limited.onespp_create_with(*arguments, address(weights), ctypes.c_size_t(weights.size), made) == 0
+    for index, frame in enumerate(frames):
+        assert torch.equal(runtime(frame, index == 0), expected[index])
+    assert limited.onespp_create_with(*arguments, address(weights), ctypes.c_size_t(weights.size - 1), made) == 2
+
+
 def test_errors_leave_everything_as_it_was(limited, frames):
     runtime, other = (CRuntime(limited, SIZE[1], SIZE[0]) for _ in range(2))
     for index, frame in enumerate(frames):
@@ -320,6 +383,7 @@ def test_errors_leave_everything_as_it_was(limited, frames):
             {"samples": np.nan},
             {"samples": 0.0},
             {"meshes": 65},
+            {"masks": 1},
             {},
         ):
             given = CFrame(**({"width": 8, "height": 8, "samples": 1.0} | changes))

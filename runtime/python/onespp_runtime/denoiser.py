@@ -80,6 +80,7 @@ class Denoiser:
         samples: float = 1.0,
         reset: bool = False,
         parts: Sequence[NDArray[np.float32]] = (),
+        masks: int = 0,
     ) -> NDArray[np.float32]:
         """The denoised radiance (H, W, 3) of the next frame.
 
@@ -108,8 +109,8 @@ class Denoiser:
         - reset: whether to forget all frames before, as after a cut
         - parts, float32 arrays (H, W, 3): noisy radiance of parts of the light, such as that of one lamp, of either
           sign. They are replaced by denoised radiance: parts that add up to the color and indirect light do so
-          afterwards. They must be light, for their past is scaled by changes of the whole. Another number of parts
-          than before resets
+          afterwards. Another number of parts than before resets
+        - masks: how many parts, the last ones, are no light: the past of light is scaled by changes of the whole
 
         Raises ValueError for a wrong shape, or a number that is out of range, and TypeError for what is no array of
         such numbers on the CPU. After an error the state is what it was.
@@ -136,7 +137,7 @@ class Denoiser:
             raise ValueError(f"object_to_world: {frame.meshes} poses, but max_meshes is {self.max_meshes}")
         if len(parts) > self.max_parts:
             raise ValueError(f"parts: {len(parts)}, but max_parts is {self.max_parts}")
-        frame.set_parts([in_place(part, size) for part in parts])
+        frame.set_parts([in_place(part, size) for part in parts], whole_number("masks", masks, 0, len(parts)))
         radiance = np.empty((*size, 3), np.float32)
         with self._lock:
             self._handle.denoise(frame, strided_image(radiance))

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-ABI = 3
+ABI = 4
 ISAS = ("any", "baseline", "avx2", "avx512")
+HISTORY = 13  # channels: see onespp_read_history
 SUFFIX = ".dll" if sys.platform == "win32" else ".so"
 
 
@@ -68,6 +69,7 @@ class FrameInputs(ctypes.Structure):
         ("object_to_world", ctypes.c_void_p),
         ("parts", ctypes.c_int),
         ("part", ctypes.POINTER(Part)),
+        ("masks", ctypes.c_int),
     )
 
     def __init__(self, **numbers: float):
@@ -82,11 +84,12 @@ class FrameInputs(ctypes.Structure):
         self.kept.append(array)
         self.mesh_id = StridedIds(array.ctypes.data, *(stride // array.itemsize for stride in array.strides))
 
-    def set_parts(self, arrays: Sequence[NDArray[np.float32]]) -> None:
-        """Parts of the light, which are denoised in place."""
+    def set_parts(self, arrays: Sequence[NDArray[np.float32]], masks: int) -> None:
+        """Parts of the light, which are denoised in place; the last ones are masks."""
         self.kept += arrays
         images = map(strided_image, arrays)
         self.parts, self.part = len(arrays), (Part * len(arrays))(*(Part(image, image) for image in images))
+        self.masks = masks
 
     def set_poses(self, poses: NDArray[np.float64]) -> None:
         self.kept.append(poses)
@@ -100,7 +103,11 @@ def load() -> ctypes.CDLL:
     library.onespp_message.restype = ctypes.c_char_p
     library.onespp_size.argtypes, library.onespp_size.restype = [pointer], ctypes.c_size_t
     library.onespp_create.argtypes = [pointer, pointer, ctypes.c_size_t, pointer]
+    library.onespp_create_with.argtypes = [pointer, pointer, ctypes.c_size_t, pointer, ctypes.c_size_t, pointer]
     library.onespp_denoise.argtypes = [pointer, pointer, pointer]
+    library.onespp_history_size.argtypes, library.onespp_history_size.restype = [pointer], ctypes.c_size_t
+    library.onespp_denoise_from.argtypes = [pointer, pointer, pointer, pointer, pointer]
+    library.onespp_read_history.argtypes, library.onespp_read_history.restype = [pointer, pointer, pointer], None
     library.onespp_isa.argtypes = [pointer]
     library.onespp_pool_create.restype = pointer
     library.onespp_pool_destroy.argtypes, library.onespp_pool_destroy.restype = [pointer], None
@@ -126,19 +133,44 @@ class ThreadPool:
 
 
 class Handle:
-    """An onespp: the denoiser with the memory it takes and its threads. Raises MemoryError without enough."""
+    """An onespp: the denoiser with the memory it takes and its threads; by default with the shipped weights.
 
-    def __init__(self, width: int, height: int, max_meshes: int, threads: int, max_isa: str, max_parts: int):
+    Raises MemoryError without enough memory, and ValueError for another number of weights.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        max_meshes: int,
+        threads: int,
+        max_isa: str,
+        max_parts: int,
+        weights: NDArray[np.float32] | None = None,
+    ):
         self.pool = ThreadPool(threads)
         self.threads = threads if self.pool.handle else 1
         tasks = 2 * self.threads if self.threads > 1 else 1  # twice as many even out their work
         run = ctypes.cast(LIBRARY.onespp_pool_run, ctypes.c_void_p) if self.pool.handle else None
         config = Config(ABI, width, height, max_meshes, tasks, run, self.pool.handle, ISAS.index(max_isa), max_parts)
         self.memory: NDArray[Any] = np.empty(LIBRARY.onespp_size(ctypes.byref(config)), np.uint8)
+        self.history_size: int = LIBRARY.onespp_history_size(ctypes.byref(config))
         self.pointer = ctypes.c_void_p()
-        memory = self.memory.ctypes.data, self.memory.size
-        check(LIBRARY.onespp_create(ctypes.byref(config), *memory, ctypes.byref(self.pointer)))
+        memory = ctypes.byref(config), self.memory.ctypes.data, self.memory.size
+        if weights is None:
+            check(LIBRARY.onespp_create(*memory, ctypes.byref(self.pointer)))
+        else:
+            numbers = np.ascontiguousarray(weights, np.float32)
+            check(LIBRARY.onespp_create_with(*memory, numbers.ctypes.data, numbers.size, ctypes.byref(self.pointer)))
         self.isa = ISAS[LIBRARY.onespp_isa(self.pointer)]
 
     def denoise(self, frame: FrameInputs, radiance: StridedImage) -> None:
         check(LIBRARY.onespp_denoise(self.pointer, ctypes.byref(frame), ctypes.byref(radiance)))
+
+    def denoise_from(self, past: int | None, after: int, frame: FrameInputs, radiance: StridedImage) -> None:
+        """From the history at address `past`, if any; writes that of the frame to `after`, `history_size` bytes."""
+        check(LIBRARY.onespp_denoise_from(self.pointer, past, after, ctypes.byref(frame), ctypes.byref(radiance)))
+
+    def read_history(self, history: int, channels: StridedImage) -> None:
+        """Writes the HISTORY channels of a history at an address."""
+        LIBRARY.onespp_read_history(self.pointer, history, ctypes.byref(channels))
