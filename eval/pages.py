@@ -10,7 +10,6 @@ import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -122,15 +121,6 @@ def extract_benchmark(runs: Path) -> dict[str, Any]:
     return {"device": " and ".join(devices), "folders": folders}
 
 
-def extract_runtime(isa: str, runs: Path) -> dict[str, Any]:
-    """Results of RUNS/runtime, if `isa` is the best instruction set of the processor."""
-    content = extract_keys("runtime/results.json", "device", "size", "rows")(runs)
-    best = next(row["form"].removeprefix("C, ") for row in content["rows"] if row["form"].startswith("C, "))
-    if best != isa:
-        raise BadInput(f"the best instruction set of {content['device']} is {best}, not {isa}")
-    return content
-
-
 def extract_times(runs: Path) -> dict[str, Any]:
     """Seconds that the first `make` after set-up and `make test` took, which they leave in RUNS, on this machine."""
     files = {name: runs / f"{name}.seconds" for name in ("make", "test")}
@@ -147,8 +137,7 @@ EXTRACTS: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {  # the com
     "times": ("make", extract_times),
     "benchmark": ("onespp benchmark run --scenes DIR", extract_benchmark),
     "glass": ("onespp eval --data data/glass --runs RUNS/glass", extract_glass),
-    "runtime": ("python -m runtime.measure", partial(extract_runtime, "AVX-512")),
-    "runtime-avx2": ("python -m runtime.measure", partial(extract_runtime, "AVX2")),
+    "runtime": ("python -m runtime.measure", extract_keys("runtime/results.json", "device", "size", "rows")),
 }
 
 

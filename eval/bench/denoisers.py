@@ -174,7 +174,8 @@ def network_of(denoiser: Denoiser) -> nn.Module | None:
 @torch.inference_mode()
 def macs_per_pixel(spec: DenoiserSpec) -> float | None:
     """Multiply-accumulates per pixel in the convolutions of the network as it runs; None without a network."""
-    denoiser = replace(spec, precision="float32", device="cpu").build()
+    # In PyTorch, whose layers can be watched.
+    denoiser = replace(spec, precision="float32", device="cpu", compiled=False).build()
     network = network_of(denoiser)
     if network is None:
         return None

@@ -6,13 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from errors import BadInput
 from eval import pages
-from eval.pages import EXTRACTS, GENERATORS, measured, noise_off
+from eval.pages import GENERATORS, measured, noise_off
 from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, read_results
 from eval.tables import TableRow, results_table, table_by_age
 from eval.tradeoff.trades import Trade, front_table, samples_table
-from files import write_json
 from models.registry import DENOISERS, prototype
 
 DOCUMENTED = {
@@ -44,16 +42,6 @@ def check(table: str) -> None:
 @pytest.mark.parametrize(("name", "arguments"), DOCUMENTED.items(), ids=DOCUMENTED)
 def test_the_documentation_s_tables(name, arguments):
     check(GENERATORS[name](*arguments))
-
-
-def test_the_runtime_is_measured_apart_on_processors_without_avx_512(tmp_path):
-    rows = [{"form": form} for form in ("PyTorch, float32", "C, AVX2", "C, baseline")]
-    content = {"device": "a processor", "size": "64x48", "rows": rows}
-    (tmp_path / "runtime").mkdir()
-    write_json(tmp_path / "runtime" / "results.json", {"schema": 1, **content})
-    assert EXTRACTS["runtime-avx2"][1](tmp_path) == content
-    with pytest.raises(BadInput, match="of a processor is AVX2, not AVX-512"):
-        EXTRACTS["runtime"][1](tmp_path)
 
 
 def test_noise_of_references_is_taken_off():
