@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from threading import Lock
 from types import ModuleType
 from typing import Any
 
@@ -156,8 +157,16 @@ class OneInC:
 
     def __init__(self, tensors: Mapping[str, Tensor]):
         """`tensors` are those of the network by name."""
-        self.weights = in_order({name: tensor.numpy() for name, tensor in tensors.items()})
+        self.__setstate__(in_order({name: tensor.numpy() for name, tensor in tensors.items()}))
+
+    def __setstate__(self, weights: Weights) -> None:
+        self.weights = weights
         self.handles: dict[tuple[int, ...], Any] = {}  # by what they are for, the last one used last
+        self.lock = Lock()  # one frame at a time: all use the same working memory
+
+    def __getstate__(self) -> Weights:
+        """Of copies and other processes, which have working memory and threads of their own."""
+        return self.weights
 
     def handle(self, frame: Frame) -> Any:
         """A denoiser of the runtime for frames of this kind, on as many threads as PyTorch uses."""
@@ -176,15 +185,16 @@ class OneInC:
         return found
 
     def takes(self, frame: Frame) -> bool:
-        """Whether it can denoise the frame. In training alone, frames have gains and are parts of others."""
-        is_plain = frame.colour_gain is None and frame.whole is None and not torch.is_grad_enabled()
-        return is_plain and is_available() and frame.shape[0] == 1 and frame.depth.device.type == "cpu"
+        """Whether it can denoise the frame. In training alone, frames have gains, gradients and are parts of others."""
+        is_trained_on = frame.colour_gain is not None or frame.whole is not None
+        differentiates = torch.is_grad_enabled() and any(each.requires_grad for each in frame.channels.values())
+        is_here = frame.shape[0] == 1 and frame.depth.device.type == "cpu"
+        return is_here and not is_trained_on and not differentiates
 
     def denoise(self, frame: Frame, state: State | None, signal: Signal) -> tuple[Tensor, StateInC]:
         """Radiance (1, 3, H, W) and the state for the next frame: see Denoiser.forward."""
         library = runtime()
         assert library
-        handle = self.handle(frame)
         before = matching_state(state, StateInC, frame)
         height, width = frame.size
         given = library.FrameInputs(width=width, height=height, reset=before is None, samples=frame.samples.item())
@@ -201,7 +211,9 @@ class OneInC:
         images = () if parts is None else [pixels_of(part[None]) for part in parts[0].split(3)]
         given.set_parts(images, frame.masks)
         past = before.history.data_ptr() if before and count_of(before.parts) == count_of(parts) else None
-        after = torch.empty(handle.history_size, dtype=torch.uint8)
         radiance = torch.empty(1, 3, height, width)
-        handle.denoise_from(past, after.data_ptr(), given, library.strided_image(pixels_of(radiance)))
+        with self.lock:
+            handle = self.handle(frame)
+            after = torch.empty(handle.history_size, dtype=torch.uint8)
+            handle.denoise_from(past, after.data_ptr(), given, library.strided_image(pixels_of(radiance)))
         return radiance, StateInC(frame.moment, handle, after, parts)

@@ -1,5 +1,8 @@
 """`one` in C is `one` in PyTorch with kernels: its outputs, its state, and what it leaves to PyTorch."""
 
+import copy
+import pickle
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -98,6 +101,18 @@ def test_pictures_of_its_state(frames):
         assert_close(picture, expected.pictures()[name])
 
 
+def test_copies_and_threads_have_working_memory_in_turn(frames):
+    denoiser = in_c()
+    expected = run(denoiser, frames)[-1]
+    for copied in (copy.deepcopy(denoiser), pickle.loads(pickle.dumps(denoiser))):
+        del denoiser
+        assert torch.equal(run(copied, frames)[-1], expected)
+        denoiser = copied
+    with ThreadPoolExecutor(3) as pool:
+        for outputs in pool.map(lambda _: run(denoiser, frames), range(3)):
+            assert torch.equal(outputs[-1], expected)
+
+
 def test_threads_change_no_bit(frames):
     before = torch.get_num_threads()
     try:
@@ -117,13 +132,14 @@ def test_what_it_leaves_to_pytorch(frames):
     def state_of(frame: Frame) -> object:
         return type(denoiser(frame, None)[1])
 
+    assert state_of(frames[0]) is StateInC
+    light = frames[0].direct.clone().requires_grad_()
+    assert state_of(frames[0].with_channels({"direct": light})) is OneState
     with torch.inference_mode():
-        assert state_of(frames[0]) is StateInC
         assert state_of(Frame.stack([frames[0], frames[1]])) is OneState
         assert state_of(replace(frames[0], colour_gain=torch.ones(1, 3, 1, 1))) is OneState
         with compiled.disabled():
             assert state_of(frames[0]) is OneState
-    assert state_of(frames[0]) is OneState
 
 
 def test_it_runs_where_denoisers_are_built_to_run():
