@@ -27,7 +27,7 @@ from provenance import ROOT, device_in_words
 MEASURED = ROOT / "docs" / "measured"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 FURTHER_PAGES = (ROOT / "runtime" / "README.md", ROOT / "models" / "shipped" / "one.md")
-MARKED = re.compile(r"<!-- measured: (.+?) -->.*?<!-- end -->", re.DOTALL)
+MARKED = re.compile(r"<!--\s*measured:\s+(.+?)\s*-->.*?<!--\s*end\s*-->", re.DOTALL)  # lines may be broken anywhere
 GLASS_FRAME = 4  # the frame from which on clips of glass are compared: history has grown
 STEADY_FRAME = 15  # that of the benchmark: history no longer grows
 SHOWN_METRICS = ("ssim", "flip", "temporal_error", "psnr")
@@ -429,7 +429,7 @@ def generate(match: re.Match[str]) -> str:
         text = GENERATORS[name](*arguments)
     except BadInput as missing:
         text = f"({missing})"
-    return f"<!-- measured: {match[1]} -->{text}<!-- end -->"
+    return f"<!-- measured: {' '.join(match[1].split())} -->{text}<!-- end -->"
 
 
 def generated(page: str) -> str:
