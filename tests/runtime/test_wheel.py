@@ -331,6 +331,17 @@ def test_parts_of_the_light_are_denoised_in_place(module, frames):
         np.testing.assert_allclose(sum(parts) + np.asarray(given["emission"]), radiance, rtol=1e-4, atol=1e-5)
 
 
+def test_a_mask_stays_what_it_is_when_light_changes(module, frames):
+    denoiser = module.Denoiser(SIZE[1], SIZE[0], max_meshes=64, max_parts=1)
+    for frame, brightness in zip(frames[:3], (1, 4, 1), strict=True):
+        given = arguments(frame)
+        given["color"] = brightness * np.asarray(given["color"])
+        mask = np.ascontiguousarray(0.25 * np.maximum(given["albedo"], 0.01), np.float32)
+        expected = mask.copy()
+        denoiser.denoise(**given, parts=[mask], masks=1)
+        np.testing.assert_allclose(mask, expected, rtol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("parts", "error", "message"),
     [
