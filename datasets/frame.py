@@ -131,6 +131,11 @@ class Frame:
         return next(iter(self.channels.values())).new_ones(self.shape[0], components, 1, 1)
 
     @property
+    def part_count(self) -> int:
+        """P, the number of parts of the light."""
+        return 0 if self.parts is None else self.parts.shape[1] // 3
+
+    @property
     def moment(self) -> Moment:
         return Moment(self.shape, self.now)
 

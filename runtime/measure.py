@@ -73,8 +73,8 @@ class Form:
     in_process: bool = True  # so that its memory can be measured
 
 
-def play_library(spec: DenoiserSpec, in_c: bool, frames: Sequence[Frame]) -> Iterator[object]:
-    """With `in_c` as the library runs it, by C if that does the work, or else by PyTorch and Numba."""
+def play_library(spec: DenoiserSpec, frames: Sequence[Frame], in_c: bool = True) -> Iterator[object]:
+    """As the library runs it, or, for `one` without C, by PyTorch and Numba."""
     denoiser, state = spec.build(), None
     if isinstance(denoiser, One) and not in_c:
         denoiser.in_c = None
@@ -185,12 +185,12 @@ def library_forms() -> Iterator[Form]:
     forms = {"onespp": "float32"} | {f"PyTorch, {precision}": precision for precision in (*fast, "float32")}
     for name, precision in forms.items():
         spec = DenoiserSpec.named("one", precision=precision, weights=shipped_weights("one"))
-        yield Form(name, megabytes, None, partial(play_library, spec, name == "onespp"))
+        yield Form(name, megabytes, None, partial(play_library, spec, in_c=name == "onespp"))
 
 
 def oidn_forms() -> Iterator[Form]:
     for name in OIDN:
-        yield Form(name, installed_mb("pyoidn"), None, partial(play_library, DenoiserSpec.named(name), True))
+        yield Form(name, installed_mb("pyoidn"), None, partial(play_library, DenoiserSpec.named(name)))
 
 
 @torch.inference_mode()

@@ -2301,7 +2301,7 @@ const char *onespp_message(int code)
         "no error",
         "compiled with another version of onespp.h",
         "a size or number of tasks is out of range",
-        "the memory is missing or too small",
+        "the memory is missing, too small or not aligned",
         "a size, a number of samples or an image is missing or out of range",
         "a camera is not finite, or its focal length is 0",
     };

@@ -22,7 +22,7 @@ enum {
     ONESPP_OK = 0,
     ONESPP_BAD_ABI = 1,    /* the program was compiled with another version of this header */
     ONESPP_BAD_CONFIG = 2, /* a size or number of tasks is out of range */
-    ONESPP_BAD_MEMORY = 3, /* the memory is NULL or smaller than onespp_size returns */
+    ONESPP_BAD_MEMORY = 3, /* the memory is NULL or smaller than onespp_size returns; a history is not aligned */
     ONESPP_BAD_FRAME = 4,  /* a size, a number of samples, or a required image is missing or out of range */
     ONESPP_BAD_CAMERA = 5  /* a camera's number is not finite, or its focal length is 0 */
 };
@@ -146,8 +146,8 @@ int onespp_denoise(onespp *denoiser, const onespp_frame *frame, const onespp_out
 size_t onespp_history_size(const onespp_config *config);
 
 /* onespp_denoise for a frame that follows the history `past`, or none where that is NULL. Its own is written to `next`,
- * which may be `past`. Both begin at multiples of 64 bytes, else ONESPP_BAD_MEMORY; a history fits denoisers of the same
- * sizes and parts. */
+ * which may be `past`. Both begin at multiples of 64 bytes, else ONESPP_BAD_MEMORY. A history fits denoisers of the same
+ * max_width, max_height and max_parts; a frame of another size or number of parts begins anew after any. */
 int onespp_denoise_from(
     onespp *denoiser, const void *past, void *next, const onespp_frame *frame, const onespp_output *radiance);
 

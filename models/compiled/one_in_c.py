@@ -94,10 +94,14 @@ def compile_library(compiler: str, folder: Path) -> None:
                 raise
 
 
+def find_compiler() -> str | None:
+    return shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+
+
 @cache
 def runtime() -> ModuleType | None:
     """The module that calls the runtime; None where it can't be compiled."""
-    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    compiler = find_compiler()
     if compiler is None or not CALLS.exists() or sys.platform == "win32":
         return None
     contents = [file.read_bytes() for file in (*C_FILES, *HEADERS, CALLS)]
@@ -116,7 +120,7 @@ def runtime() -> ModuleType | None:
 
 
 def is_available() -> bool:
-    """Whether this machine runs it; compiles it if need be, which takes some 10 s, once."""
+    """Whether this machine runs it; compiles it if need be, which takes seconds, once."""
     return runtime() is not None
 
 
@@ -134,11 +138,9 @@ class StateInC(State):
     parts: Tensor | None  # radiance (1, 3 P, H, W)
 
     def pictures(self) -> dict[str, Tensor]:
-        library = runtime()
-        assert library
         _, height, width = self.moment.shape
-        images = torch.empty(1, library.HISTORY, height, width)
-        self.handle.read_history(self.history.data_ptr(), library.strided_image(pixels_of(images)))
+        channels = self.handle.read_history(self.history.data_ptr(), height, width)
+        images = torch.from_numpy(channels).movedim(-1, 0)[None]
         return {"history length": images[:, 6:7], "accumulated": images[:, 3:6]}
 
 
@@ -147,9 +149,16 @@ def pixels_of(images: Tensor) -> NDArray[Any]:
     return images[0].movedim(0, -1).numpy()
 
 
-def count_of(parts: Tensor | None) -> int:
-    """The channels of parts of the light, (B, 3 P, H, W)."""
-    return 0 if parts is None else parts.shape[1]
+def mesh_count(frame: Frame) -> int:
+    return frame.now.object_to_world.shape[1]
+
+
+def is_within_limits(frame: Frame, limits: ModuleType) -> bool:
+    """Whether a frame is as small as those of the runtime, whose module has the limits."""
+    fits = max(frame.size) <= limits.MAX_SIDE and mesh_count(frame) <= limits.MAX_MESHES
+    samples = frame.samples.flatten()
+    counts = (samples >= limits.MIN_SAMPLES).all() and (samples <= limits.MAX_SAMPLES).all()
+    return fits and frame.part_count <= limits.MAX_PARTS and bool(counts)
 
 
 class OneInC:
@@ -161,6 +170,7 @@ class OneInC:
 
     def __setstate__(self, weights: Weights) -> None:
         self.weights = weights
+        self.library = runtime()
         self.handles: dict[tuple[int, ...], Any] = {}  # by what they are for, the last one used last
         self.lock = Lock()  # one frame at a time: all use the same working memory
 
@@ -170,22 +180,26 @@ class OneInC:
 
     def handle(self, frame: Frame) -> Any:
         """A denoiser of the runtime for frames of this kind, on as many threads as PyTorch uses."""
+        assert self.library
         height, width = frame.size
-        meshes = -(-frame.now.object_to_world.shape[1] // ROOM_FOR_MESHES) * ROOM_FOR_MESHES
-        parts = 0 if frame.parts is None else frame.parts.shape[1] // 3
-        key = (width, height, meshes, torch.get_num_threads(), parts)
+        meshes = -(-mesh_count(frame) // ROOM_FOR_MESHES) * ROOM_FOR_MESHES
+        threads = min(torch.get_num_threads(), self.library.MAX_THREADS)
+        key = (width, height, meshes, threads, frame.part_count)
         found = self.handles.pop(key, None)
         if found is None:
-            library = runtime()
-            assert library
-            found = library.Handle(*key[:4], limited_isa(), parts, self.weights)
+            found = self.library.Handle(*key[:4], limited_isa(), key[4], self.weights)
         self.handles[key] = found
         while len(self.handles) > KEPT_SIZES:
             del self.handles[next(iter(self.handles))]
         return found
 
     def takes(self, frame: Frame) -> bool:
-        """Whether it can denoise the frame. In training alone, frames have gains, gradients and are parts of others."""
+        """Whether it can denoise the frame: within the limits of onespp.h, and not in training.
+
+        In training alone, frames have gains, gradients and are crops of others.
+        """
+        if self.library is None or not is_within_limits(frame, self.library):
+            return False
         is_trained_on = frame.colour_gain is not None or frame.whole is not None
         differentiates = torch.is_grad_enabled() and any(each.requires_grad for each in frame.channels.values())
         is_here = frame.shape[0] == 1 and frame.depth.device.type == "cpu"
@@ -193,11 +207,10 @@ class OneInC:
 
     def denoise(self, frame: Frame, state: State | None, signal: Signal) -> tuple[Tensor, StateInC]:
         """Radiance (1, 3, H, W) and the state for the next frame: see Denoiser.forward."""
-        library = runtime()
-        assert library
+        assert self.library
         before = matching_state(state, StateInC, frame)
         height, width = frame.size
-        given = library.FrameInputs(width=width, height=height, reset=before is None, samples=frame.samples.item())
+        given = self.library.FrameInputs(width=width, height=height, samples=frame.samples.item())
         lights = ("direct", "indirect", "emission") if signal == "total" else ("indirect",)
         for name, light in zip(("direct", "indirect", "emission"), lights, strict=False):
             given.set_image(name, pixels_of(frame.channel(light)))
@@ -210,10 +223,10 @@ class OneInC:
         parts = None if frame.parts is None else frame.parts.clone()  # they are denoised in place
         images = () if parts is None else [pixels_of(part[None]) for part in parts[0].split(3)]
         given.set_parts(images, frame.masks)
-        past = before.history.data_ptr() if before and count_of(before.parts) == count_of(parts) else None
+        past = before.history.data_ptr() if before else None  # with other parts it is not continued
         radiance = torch.empty(1, 3, height, width)
         with self.lock:
             handle = self.handle(frame)
             after = torch.empty(handle.history_size, dtype=torch.uint8)
-            handle.denoise_from(past, after.data_ptr(), given, library.strided_image(pixels_of(radiance)))
+            handle.denoise_from(past, after.data_ptr(), given, self.library.strided_image(pixels_of(radiance)))
         return radiance, StateInC(frame.moment, handle, after, parts)

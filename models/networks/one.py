@@ -307,7 +307,7 @@ def fetched(before: OneState | None, frame: Frame, noisy: Tensor, surface: Tenso
 
     Irradiance among them follows the changes of `noisy`, the frame's (B, 3, H, W).
     """
-    parts = count_of_parts(frame)
+    parts = 3 * frame.part_count
     has_history = torch.zeros_like(surface)
     if before is None:
         nothing = has_history.expand(-1, sum(HISTORY), -1, -1)
@@ -326,11 +326,6 @@ def fetched(before: OneState | None, frame: Frame, noisy: Tensor, surface: Tenso
     whole, light, light_accumulated, rest, mask, mask_accumulated = history.split(sizes, dim=1)
     of_parts = torch.cat([light, mask, light_accumulated, mask_accumulated], dim=1)
     return torch.cat([whole, rest], dim=1), of_parts, has_history
-
-
-def count_of_parts(frame: Frame) -> int:
-    """The channels of a frame's parts of the light."""
-    return 0 if frame.parts is None else frame.parts.shape[1]
 
 
 def part_irradiance(frame: Frame, whole: Tensor, clamped: Tensor) -> Tensor:
@@ -360,7 +355,7 @@ class One(Denoiser):
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
         before = matching_state(state, OneState, frame)
-        if before and before.part_output.shape[1] != count_of_parts(frame):
+        if before and before.part_output.shape[1] != 3 * frame.part_count:
             before = None  # the parts would not add up to the whole
         surface = (frame.depth > 0).to(frame.depth)
         decoded, past, scale = self.decoded(frame, before, surface)

@@ -4,7 +4,6 @@ import ctypes
 import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from shutil import which
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from datasets.frame import Frame
+from models.compiled.one_in_c import FLAGS, find_compiler
 from models.networks.one import One
 from models.registry import create, require_shipped
 from models.weights import load_weights
@@ -20,9 +20,9 @@ from runtime.raw import PLANES
 
 FOLDER = ROOT / "runtime"
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror")
-OPTIMISED = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-DONESPP_DISPATCH")
+OPTIMISED = FLAGS  # those that the library compiles it with
 SOURCES = tuple(FOLDER / name for name in ("onespp.c", "onespp_avx2.c", "onespp_avx512.c"))
-CC = which("cc") or which("gcc") or which("clang") or ""
+CC = find_compiler() or ""
 ABI = 4
 ISAS = {"any": 0, "baseline": 1, "avx2": 2, "avx512": 3}
 
@@ -167,7 +167,7 @@ class CRuntime:
         given.camera_to_world[:] = frame.now.camera_to_world[0].flatten().tolist()
         given.meshes, given.object_to_world = len(poses), address(poses)
         given.masks = frame.masks
-        given.parts = 0 if frame.parts is None else frame.parts.shape[1] // 3
+        given.parts = frame.part_count
         parts = np.empty((0, height, width), np.float32)
         if frame.parts is not None:  # which are denoised in place
             parts = frame.parts[0].numpy().copy()

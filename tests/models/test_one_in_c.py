@@ -142,6 +142,23 @@ def test_what_it_leaves_to_pytorch(frames):
             assert state_of(frames[0]) is OneState
 
 
+def test_what_is_beyond_the_limits_of_c_runs_in_pytorch(frames):
+    denoiser = in_c()
+    many = replace(frames[0], parts=frames[0].direct.repeat(1, 17, 1, 1))
+    wide = synthetic_frame(0, 1, 16385)
+    for frame in (many, wide, replace(frames[0], spp=torch.full((1, 1, 1, 1), 1e-4))):
+        output, state = denoiser(frame, None)
+        assert isinstance(state, OneState) and output.isfinite().all()
+
+
+def test_history_begins_anew_with_other_parts(frames):
+    denoiser = in_c()
+    _, state = denoiser(frames[0], None)
+    after, _ = denoiser(in_parts(frames[1], 0), state)
+    anew, _ = denoiser(in_parts(frames[1], 0), None)
+    assert torch.equal(after, anew)
+
+
 def test_it_runs_where_denoisers_are_built_to_run():
     spec = DenoiserSpec.named("one+js")
     assert fastest_precision("one+js") == "float32"

@@ -10,14 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import Array, to_colour, to_ids, to_image, to_matrices, to_poses
-from .library import ISAS, FrameInputs, Handle, strided_image
-
-# Limits of onespp.h. Each thread has two tasks.
-MAX_SIDE = 16384
-MAX_MESHES = 65536
-MAX_THREADS = 512
-MAX_PARTS = 16
-MIN_SAMPLES, MAX_SAMPLES = 1e-3, 1e9
+from .library import (
+    ISAS,
+    MAX_MESHES,
+    MAX_PARTS,
+    MAX_SAMPLES,
+    MAX_SIDE,
+    MAX_THREADS,
+    MIN_SAMPLES,
+    FrameInputs,
+    Handle,
+    strided_image,
+)
 
 ROOM_FOR_MESHES = 4096  # of the state that `denoise` makes: few bytes each
 CHANNELS_OF = {"indirect": 3, "emission": 3, "albedo": 3, "normal": 3, "depth": 1, "roughness": 1, "motion": 2}

@@ -13,6 +13,14 @@ from numpy.typing import NDArray
 ABI = 4
 ISAS = ("any", "baseline", "avx2", "avx512")
 HISTORY = 13  # channels: see onespp_read_history
+
+# Limits of onespp.h. Each thread has two tasks.
+MAX_SIDE = 16384
+MAX_MESHES = 65536
+MAX_THREADS = 512
+MAX_PARTS = 16
+MIN_SAMPLES, MAX_SAMPLES = 1e-3, 1e9
+
 SUFFIX = ".dll" if sys.platform == "win32" else ".so"
 
 
@@ -171,6 +179,8 @@ class Handle:
         """From the history at address `past`, if any; writes that of the frame to `after`, `history_size` bytes."""
         check(LIBRARY.onespp_denoise_from(self.pointer, past, after, ctypes.byref(frame), ctypes.byref(radiance)))
 
-    def read_history(self, history: int, channels: StridedImage) -> None:
-        """Writes the HISTORY channels of a history at an address."""
-        LIBRARY.onespp_read_history(self.pointer, history, ctypes.byref(channels))
+    def read_history(self, history: int, height: int, width: int) -> NDArray[np.float32]:
+        """The channels (H, W, HISTORY) of the history at an address, which a frame of that size left."""
+        channels = np.empty((height, width, HISTORY), np.float32)
+        LIBRARY.onespp_read_history(self.pointer, history, ctypes.byref(strided_image(channels)))
+        return channels
