@@ -58,6 +58,7 @@ class NamedDenoiser:
             "precision": self.spec.precision,
             "weights": self.weights_digest,
             "device": self.spec.device,
+            "c": self.spec.c_digest,
         }
         return result_key(clip, [__name__, *self.spec.modules], facts)
 

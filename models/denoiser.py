@@ -165,12 +165,12 @@ class Denoiser(nn.Module):
         self.to(precision)
         self.precision = precision
 
-    def computes_in_c(self) -> bool:
-        """Whether compiled C does its work here once `use_c` is called; the first call may compile it."""
-        return False
+    def c_digest(self) -> str | None:
+        """The digest of the C code that can do its work here, None without any; the first call may compile it."""
+        return None
 
     def use_c(self) -> None:
-        """Do so from now on, in inference on the CPU, with the weights there are."""
+        """Let C code do the work if it can, in inference on the CPU, with the weights there are."""
 
     def parameter_count(self) -> int:
         return sum(parameter.numel() for parameter in self.parameters())

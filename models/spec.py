@@ -75,7 +75,7 @@ def fastest_precision(name: str | DenoiserName, device: str = "cpu") -> str:
     check_device(device)
     if not prototype(name).is_network or "bfloat16" not in precisions_of(name):
         return "float32"
-    if device == "cpu" and unwrapped(prototype(name)).computes_in_c():
+    if device == "cpu" and unwrapped(prototype(name)).c_digest():
         return "float32"
     is_faster = bfloat16_is_faster() if device == "cpu" else torch.cuda.is_bf16_supported(including_emulation=False)
     return "bfloat16" if is_faster else "float32"
@@ -137,6 +137,15 @@ class DenoiserSpec:
         """The modules of onespp that define the denoiser and its wrappers."""
         return tuple(type(layer).__module__ for layer in layers_of(self.facts))
 
+    @property
+    def may_use_c(self) -> bool:
+        return self.compiled and self.device == "cpu" and self.precision == "float32"
+
+    @property
+    def c_digest(self) -> str | None:
+        """The digest of the C code that computes in its network's place, if any."""
+        return unwrapped(self.facts).c_digest() if self.may_use_c else None
+
     def build(self) -> Denoiser:
         """Ready to use. Raises BadInput where it cannot run here, or its weights are damaged or another network's."""
         check_device(self.device)
@@ -146,7 +155,7 @@ class DenoiserSpec:
             load_weights(unwrapped(denoiser), self.denoiser.base, self.weights)
         denoiser.prepare(PRECISIONS[self.precision])
         denoiser.device = self.device
-        if self.compiled and self.device == "cpu" and self.precision == "float32":
+        if self.may_use_c:
             unwrapped(denoiser).use_c()
         return denoiser.to(self.device)
 

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from tqdm import tqdm
 
 from datasets.frame import Frame, Signal
 from files import cache_folder
@@ -98,23 +99,37 @@ def find_compiler() -> str | None:
     return shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
 
+def digest() -> str:
+    """SHA-256 of the runtime's sources and how they are compiled, as hexadecimal digits."""
+    contents = [file.read_bytes() for file in (*C_FILES, *HEADERS, CALLS)]
+    command = " ".join((str(find_compiler()), *FLAGS))
+    return hashlib.sha256(b"\0".join([*contents, command.encode()])).hexdigest()
+
+
+def tell(text: str) -> None:
+    tqdm.write(f"one: {text}", file=sys.stderr)
+
+
 @cache
 def runtime() -> ModuleType | None:
-    """The module that calls the runtime; None where it can't be compiled."""
-    compiler = find_compiler()
-    if compiler is None or not CALLS.exists() or sys.platform == "win32":
+    """The module that calls the runtime; None where it can't be compiled, which is said on the console."""
+    if not CALLS.exists() or sys.platform == "win32":
         return None
-    contents = [file.read_bytes() for file in (*C_FILES, *HEADERS, CALLS)]
-    digest = hashlib.sha256(b"\0".join([*contents, " ".join((compiler, *FLAGS)).encode()])).hexdigest()
-    folder = cache_folder() / f"one-{digest[:16]}"
+    compiler = find_compiler()
+    if compiler is None:
+        tell("no C compiler is found (cc, gcc or clang): it runs in PyTorch, which takes longer")
+        return None
+    folder = cache_folder() / f"one-{digest()[:16]}"
     try:
         if not folder.exists():
+            tell(f"{compiler} compiles it for this machine, once, which takes seconds")
             compile_library(compiler, folder)
         spec = spec_from_file_location("onespp_in_c", folder / CALLS.name)
         assert spec and spec.loader
         module = module_from_spec(spec)
         spec.loader.exec_module(module)
-    except (OSError, subprocess.CalledProcessError):
+    except (OSError, subprocess.CalledProcessError) as error:
+        tell(f"it runs in PyTorch, which takes longer, because its C code can't be compiled or loaded: {error}")
         return None
     return module
 

@@ -413,11 +413,11 @@ class One(Denoiser):
         head = self.network(patches.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
         return Decoded(*decode_head(head.to(inputs.noisy), hidden, last, inputs, frame.samples.to(inputs.noisy)))
 
-    def computes_in_c(self) -> bool:
-        return self.widths == One.widths and one_in_c.is_available()
+    def c_digest(self) -> str | None:
+        return one_in_c.digest() if self.widths == One.widths and one_in_c.is_available() else None
 
     def use_c(self) -> None:
-        if self.computes_in_c():
+        if self.c_digest():
             self.in_c = OneInC(self.network.state_dict())
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:

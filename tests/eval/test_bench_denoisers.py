@@ -141,7 +141,7 @@ def test_denoisers_declare_whether_they_have_kernels(name, monkeypatch):
     if cannot_run(parse_name(name)):
         pytest.skip(f"{name} cannot run here")
     # In bfloat16 those run kernels that C computes in float32.
-    precision = "bfloat16" if prototype(name).computes_in_c() else "float32"
+    precision = "bfloat16" if prototype(name).c_digest() else "float32"
     compile_kernels(DenoiserSpec.named(name, precision=precision))
     assert bool(calls) == DENOISERS[name].has_kernels
 

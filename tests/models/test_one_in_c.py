@@ -169,21 +169,23 @@ def test_it_runs_where_denoisers_are_built_to_run():
 
 
 @pytest.mark.parametrize("compiler", [None, "false"])
-def test_without_a_compiler_pytorch_computes(frames, monkeypatch, tmp_path, compiler):
+def test_without_a_compiler_pytorch_computes_and_says_so(frames, monkeypatch, tmp_path, capsys, compiler):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(one_in_c.shutil, "which", lambda name: compiler)
     one_in_c.runtime.cache_clear()
     try:
         denoiser = in_c()
         assert not one_in_c.is_available() and denoiser.in_c is None
+        assert DenoiserSpec.named("one").c_digest is None
         assert isinstance(play(denoiser, frames[:1])[1], OneState)
     finally:
         one_in_c.runtime.cache_clear()
     assert not [*tmp_path.glob("onespp/*")]
+    assert "one: " in (text := capsys.readouterr().err) and "PyTorch" in text
 
 
 def test_it_is_compiled_once_and_anew_when_sources_change(monkeypatch, tmp_path):
-    made = []
+    made, digests = [], []
 
     def record(compiler, folder):
         folder.mkdir(parents=True)
@@ -196,10 +198,11 @@ def test_it_is_compiled_once_and_anew_when_sources_change(monkeypatch, tmp_path)
         for flags in (one_in_c.FLAGS, one_in_c.FLAGS, ("-O1",)):
             monkeypatch.setattr(one_in_c, "FLAGS", flags)
             one_in_c.runtime.cache_clear()
-            assert one_in_c.is_available()
+            digests.append(DenoiserSpec.named("one").c_digest)
     finally:
         one_in_c.runtime.cache_clear()
     assert len(made) == 2
+    assert digests[0] and digests[0] == digests[1] != digests[2]
 
 
 def test_an_instruction_set_can_be_ruled_out(frames, monkeypatch):
