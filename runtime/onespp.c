@@ -6,8 +6,9 @@
  *   enter      reprojection, neighbourhood statistics, inputs of the network, its per-pixel and first layers
  *   layers     the U-Net at 1/2, 1/4 and 1/8 of the resolution
  *   leave      its last layers, decoded into the parameters of the filter and the new accumulation
- *   filter     two levels of an a-trous filter, which spread outliers, all six of it, and three of these guided by
- *              luminance; the last one writes the output and what the next frame needs
+ *   filter     two levels of an a-trous filter, which spread outliers, all six of it, and four of these guided by
+ *              luminance; the last one leaves what the next frame needs
+ *   write      the output, whose coarse neighbourhoods get the mean that their samples have
  *
  * `enter` to `leave` work on strips of rows, so that activations take little memory. Strips overlap: what 3 x 3 taps
  * below and above a strip need is computed twice, except for `enter`, whose results are kept from strip to strip.
@@ -72,8 +73,11 @@ enum {
     HALF_CHUNK = CHUNK / 2,
     MIN_STRIP_ROWS = 64,
     BLOCK = 16,       /* pixels, the side of the squares whose luminance is measured */
-    GAIN_RADIUS = 6,  /* blocks around one in which a change of light is looked for */
-    GAIN_TAPS = 2 * GAIN_RADIUS + 1,
+    GAIN_DEVIATION = 2, /* blocks, of the Gaussian that weights them where a change of light is looked for */
+    TILE = 8,         /* pixels, the side of the squares that coarse neighbourhoods are made of */
+    WIDE_DEVIATION = 4, NARROW_DEVIATION = 1, /* tiles, of the Gaussians that weight these */
+    REACH = 3,        /* deviations: the radius of Gaussians */
+    MAX_GAUSSIAN = 2 * REACH * WIDE_DEVIATION + 1,
     MEDIAN_GRID = 64, /* the median depth of large images is taken from about as many rows and columns */
     MAX_DEPTHS = (2 * MEDIAN_GRID - 1) * (2 * MEDIAN_GRID - 1),
     PAD = 16,   /* floats before a line of activations: alignment, and zeros to the left of the image */
@@ -102,9 +106,11 @@ enum {
 #define OUTLIER 8.f /* times the mean over 9 x 9 pixels: what is brighter is spread */
 #define GUIDANCE 30.f /* weight of squared differences of the guide beside those of features, for each sample */
 #define DARKEST 0.01f /* exposed luminance: what is darker looks alike to guided levels */
-#define GAIN_DEVIATION 2.f /* blocks, of the Gaussian that weights them */
 #define GAIN_NOISE 3.f /* standard errors: smaller changes of light do not count */
-#define MAX_GAIN 4.f /* of history, a frame */
+#define COARSE_NOISE 2.f /* the same of residuals */
+#define COARSE_DARK 0.3f /* exposed luminance: residuals of what is darker count less than relative ones */
+#define COARSE_LENGTH 4.f /* frames that residuals are averaged over at most */
+#define MAX_GAIN 4.f /* of a neighbourhood, a frame */
 #define MIN_CHANGE 1e-30f /* of sums of luminance, to divide by */
 #define MAX_LOGIT 10.f
 #define MIN_LOGIT -40.f
@@ -187,6 +193,8 @@ static float float_of_half(uint16_t half)
 static int rounded_up(int x, int multiple) { return (x + multiple - 1) / multiple * multiple; }
 
 static int blocks_along(int size) { return (size + BLOCK - 1) / BLOCK; }
+
+static int tiles_along(int size) { return (size + TILE - 1) / TILE; }
 
 /* --- State and memory --------------------------------------------------------------------------------------------- */
 
@@ -282,12 +290,24 @@ typedef struct {
     int count;
 } RunningMean;
 
-/* How the light of a block has changed where it has a history: sums over pixels. */
+/* How the light of a block has changed where it has a history, or what a tile's denoised light lacks: sums over pixels. */
 typedef struct {
-    float past;           /* luminance of the history */
-    float change, square; /* that of the frame less that of the history, and its square */
-    float gain;           /* what the history is multiplied by */
+    float past;             /* luminance of the history, or of the denoised light */
+    float change, variance; /* that of the frame less that, and its variance */
+    float gain;             /* what the light is multiplied by */
 } Change;
+
+/* The residual of a tile: what its samples have more than its denoised light, relative. */
+typedef struct {
+    float sum, variance; /* over pixels, the mean over frames */
+    float length;        /* frames */
+} Residual;
+
+/* What one frame adds to it, as sums over pixels, and what it corrects. */
+typedef struct {
+    float residual, square, light, motion[2], pixels;
+    float gain;
+} Comparison;
 
 /* How a mesh moves from this frame's camera space to the world's axes around the previous eye. */
 typedef struct {
@@ -373,6 +393,7 @@ typedef struct {
     float *part_texels; /* PART_HISTORY of each part */
     float *depth;
     int32_t *mesh;
+    Residual *residuals; /* of tiles */
 } History;
 
 struct onespp {
@@ -393,6 +414,9 @@ struct onespp {
     double *blocks; /* mean luminance of each, -1 without surfaces */
     Change *changes; /* of the blocks' light */
     Change *row_changes; /* the same, summed along rows */
+    Change *tiles, *row_tiles; /* the same of tiles' residuals */
+    Comparison *comparisons; /* of tiles */
+    Residual *residuals;
     float *depths;
     Scratch *scratch;
     float *parameters;
@@ -412,6 +436,12 @@ static void *allocate(Arena *arena, uint64_t count, size_t size)
 
 static ptrdiff_t pitch_of(const onespp_config *config) { return PITCH(MARGIN + config->max_width + MARGIN); }
 
+/* How many squares of that side an image has at most. */
+static uint64_t count_squares(const onespp_config *config, int side)
+{
+    return (uint64_t)((config->max_width + side - 1) / side) * (uint64_t)((config->max_height + side - 1) / side);
+}
+
 static History lay_out_history(const onespp_config *config, Arena *arena)
 {
     uint64_t pixels = (uint64_t)config->max_height * (uint64_t)pitch_of(config);
@@ -421,6 +451,7 @@ static History lay_out_history(const onespp_config *config, Arena *arena)
     history.part_texels = allocate(arena, pixels * PART_HISTORY * (uint64_t)config->max_parts, sizeof(float));
     history.depth = allocate(arena, pixels, sizeof(float));
     history.mesh = allocate(arena, pixels, sizeof(int32_t));
+    history.residuals = allocate(arena, count_squares(config, TILE), sizeof(Residual));
     history.object_to_world = allocate(arena, (uint64_t)config->max_meshes * 16, sizeof(double)); /* may be longer */
     return history;
 }
@@ -485,7 +516,7 @@ static void lay_out_layers(onespp *d, Arena *arena)
 static void lay_out(onespp *d, Arena *arena)
 {
     uint64_t height = (uint64_t)d->config.max_height;
-    uint64_t blocks = (uint64_t)(d->config.max_width + BLOCK - 1) / BLOCK * ((height + BLOCK - 1) / BLOCK);
+    uint64_t blocks = count_squares(&d->config, BLOCK), tiles = count_squares(&d->config, TILE);
     d->pitch = pitch_of(&d->config);
     uint64_t pixels = height * (uint64_t)d->pitch;
     d->own_history = allocate(arena, 1, measure_history(&d->config));
@@ -495,6 +526,10 @@ static void lay_out(onespp *d, Arena *arena)
     d->blocks = allocate(arena, blocks, sizeof(double));
     d->changes = allocate(arena, blocks, sizeof(Change));
     d->row_changes = allocate(arena, blocks, sizeof(Change));
+    d->tiles = allocate(arena, tiles, sizeof(Change));
+    d->row_tiles = allocate(arena, tiles, sizeof(Change));
+    d->comparisons = allocate(arena, tiles, sizeof(Comparison));
+    d->residuals = allocate(arena, tiles, sizeof(Residual));
     d->depths = allocate(arena, MAX_DEPTHS, sizeof(float));
     d->scratch = allocate(arena, (uint64_t)d->config.tasks, sizeof(Scratch));
     lay_out_layers(d, arena);
@@ -1062,7 +1097,7 @@ static void add_change(const Job *job, int y, int x0, int n, Change *changes)
         Change *block = changes + i / BLOCK;
         block->past += past[i];
         block->change += change[i];
-        block->square += change[i] * change[i];
+        block->variance += change[i] * change[i];
     }
 }
 
@@ -1093,70 +1128,79 @@ static void reproject_rows(Job *job, Scratch *scratch, int first, int last)
     }
 }
 
-/* The weighted sum of changes around the one at `index` of `count`, `step` apart. */
-static Change sum_around(const Change *changes, int index, int count, ptrdiff_t step, const float *weights)
+/* The weighted sum of changes up to `radius` around the one at `index` of `count`, `step` apart. */
+static Change sum_around(
+    const Change *changes, int index, int count, ptrdiff_t step, const float *weights, int radius)
 {
     Change sum = {0, 0, 0, 1};
-    for (int tap = maxi(0, GAIN_RADIUS - index); tap < mini(GAIN_TAPS, count - index + GAIN_RADIUS); tap++) {
-        const Change *there = changes + (index + tap - GAIN_RADIUS) * step;
+    for (int tap = maxi(0, radius - index); tap < mini(2 * radius + 1, count - index + radius); tap++) {
+        const Change *there = changes + (index + tap - radius) * step;
         sum.past += weights[tap] * there->past;
         sum.change += weights[tap] * there->change;
-        sum.square += weights[tap] * there->square;
+        sum.variance += weights[tap] * there->variance;
     }
     return sum;
 }
 
-/* What a history is multiplied by where its surroundings have changed: the ratio, shrunk by the noise of the change. The
- * squared standard error of a sum of values d with weights w is that of w^2 d^2, for a Gaussian w half that of w d^2. */
-static float gain_of(const Change *around)
+/* What light is multiplied by where its surroundings have changed: the ratio, shrunk by the noise of the change, which
+ * counts from so many standard errors on. The squared standard error of a sum with weights w is that of w^2 v for values
+ * of variance v, for a Gaussian w half that of w v. */
+static float gain_of(const Change *around, float errors)
 {
     float size = maxf(fabsf(around->change), MIN_CHANGE);
-    float noise = GAIN_NOISE * GAIN_NOISE / 2 * around->square / size / size;
+    float noise = errors * errors / 2 * around->variance / size / size;
     float relative = maxf(minf(around->change / maxf(around->past, MIN_CHANGE), MAX_GAIN - 1), 1 / MAX_GAIN - 1);
     return 1 + maxf(1 - noise, 0) * relative;
 }
 
-/* The gain of each block. */
-static void find_gains(const Job *job)
+/* The gain of each of rows * columns squares; `sums` has room for as many. */
+static void find_gains(Change *changes, Change *sums, int rows, int columns, int deviation, float errors)
 {
-    onespp *d = job->d;
-    int columns = blocks_along(job->frame.width), rows = blocks_along(job->frame.height);
-    float weights[GAIN_TAPS];
-    for (int i = 0; i < GAIN_TAPS; i++) {
-        float distance = (float)(i - GAIN_RADIUS) / GAIN_DEVIATION;
+    float weights[MAX_GAUSSIAN];
+    int radius = REACH * deviation;
+    for (int i = 0; i < 2 * radius + 1; i++) {
+        float distance = (float)(i - radius) / (float)deviation;
         weights[i] = expf(-distance * distance / 2);
     }
     for (int i = 0; i < rows * columns; i++)
-        d->row_changes[i] = sum_around(d->changes + i / columns * columns, i % columns, columns, 1, weights);
+        sums[i] = sum_around(changes + i / columns * columns, i % columns, columns, 1, weights, radius);
     for (int i = 0; i < rows * columns; i++) {
-        Change around = sum_around(d->row_changes + i % columns, i / columns, rows, columns, weights);
-        d->changes[i].gain = gain_of(&around);
+        Change around = sum_around(sums + i % columns, i / columns, rows, columns, weights, radius);
+        changes[i].gain = gain_of(&around, errors);
     }
 }
 
-/* Where a pixel lies between the centres of blocks: the one before it, and how far it is to the next. */
-static float between_blocks(int pixel, int *before)
+/* Where a pixel lies between the centres of squares: the one before it, and how far it is to the next. */
+static float between(int pixel, int side, int *before)
 {
-    float place = maxf(((float)pixel + 0.5f) / BLOCK - 0.5f, 0);
+    float place = maxf(((float)pixel + 0.5f) / (float)side - 0.5f, 0);
     *before = (int)place;
     return place - (float)*before;
 }
 
-/* Multiplies the light in the history of n pixels of a row by the gain, interpolated between blocks. */
-static void follow_light(const Job *job, int y, int x0, int n)
+/* The gain of n pixels of a row, interpolated between squares of that side. */
+static void interpolate_gain(
+    float *restrict gain, const Job *job, const Change *changes, int side, int y, int x0, int n)
 {
-    const onespp *d = job->d;
-    int columns = blocks_along(job->frame.width), rows = blocks_along(job->frame.height), above, left;
-    float gain[LINE], down = between_blocks(y, &above);
-    const Change *upper = d->changes + (ptrdiff_t)above * columns;
-    const Change *lower = d->changes + (ptrdiff_t)mini(above + 1, rows - 1) * columns;
+    int columns = (job->frame.width + side - 1) / side, rows = (job->frame.height + side - 1) / side, above, left;
+    float down = between(y, side, &above);
+    const Change *upper = changes + (ptrdiff_t)above * columns;
+    const Change *lower = changes + (ptrdiff_t)mini(above + 1, rows - 1) * columns;
     for (int i = 0; i < n; i++) {
-        float across = between_blocks(x0 + i, &left);
+        float across = between(x0 + i, side, &left);
         int right = mini(left + 1, columns - 1);
         float first = upper[left].gain + down * (lower[left].gain - upper[left].gain);
         float second = upper[right].gain + down * (lower[right].gain - upper[right].gain);
         gain[i] = first + across * (second - first);
     }
+}
+
+/* Multiplies the light in the history of n pixels of a row by the gain of blocks. */
+static void follow_light(const Job *job, int y, int x0, int n)
+{
+    const onespp *d = job->d;
+    float gain[LINE];
+    interpolate_gain(gain, job, d->changes, BLOCK, y, x0, n);
     for (int c = OUTPUT; c < LENGTH; c++) {
         float *restrict line = row_line(d, y, OUTPUT_LINES + c) + x0;
         for (int i = 0; i < n; i++)
@@ -2031,18 +2075,6 @@ static void filter_rows(Job *job, Scratch *scratch, int first, int last)
 
 /* --- The end of a frame ------------------------------------------------------------------------------------------- */
 
-/* One colour of the denoised radiance. */
-static void write_radiance(const Job *job, int channel, const float *restrict irradiance, int y, int x0, int n)
-{
-    float divisor[LINE], emission[LINE];
-    load_divisor(divisor, &job->frame, channel, y, x0, n);
-    load(emission, &job->frame.emission, channel, y, x0, n);
-    ptrdiff_t step = job->radiance.column;
-    float *to = job->radiance.data + job->radiance.channel * channel + job->radiance.row * y + step * x0;
-    for (int i = 0; i < n; i++)
-        to[i * step] = irradiance[i] * divisor[i] + emission[i];
-}
-
 /* What the next frame's reprojection reads. */
 static void remember(const Job *job, int y, int x0, int n)
 {
@@ -2067,22 +2099,14 @@ static void remember(const Job *job, int y, int x0, int n)
     load_mesh(d->next.mesh + pixel, &job->frame, y, x0, n);
 }
 
-/* A colour of a part of the light, blended and written: where no surface is, it stays as it is. */
+/* A colour of a part of the light, blended. */
 static void finish_part(const Job *job, int part, int channel, const float *restrict filtered, int y, int x0, int n)
 {
-    float divisor[LINE], noisy[LINE];
     const float *restrict alpha = row_line(job->d, y, ALPHA_LINE) + x0;
     const float *restrict importance = row_line(job->d, y, LEVEL_LINES + 3 * LEVELS - 1) + x0;
     float *restrict output = part_line(job->d, y, part, PART_OUTPUT + channel) + x0;
-    const onespp_output *image = &job->frame.part[part].radiance;
-    float *to = image->data + image->channel * channel + image->row * y + image->column * x0;
-    load_divisor(divisor, &job->frame, channel, y, x0, n);
-    load(noisy, &job->frame.part[part].noisy, channel, y, x0, n);
-    for (int i = 0; i < n; i++) {
-        int is_surface = importance[i] > NO_WEIGHT;
-        output[i] = is_surface ? output[i] + alpha[i] * (filtered[i] - output[i]) : 0;
-        to[i * image->column] = is_surface ? output[i] * divisor[i] : noisy[i];
-    }
+    for (int i = 0; i < n; i++)
+        output[i] = importance[i] > NO_WEIGHT ? output[i] + alpha[i] * (filtered[i] - output[i]) : 0;
 }
 
 /* The last level: its output, divided by the mass, is blended into that of the previous frame. */
@@ -2110,7 +2134,6 @@ static void finish_rows(Job *job, Scratch *scratch, int first, int last)
                     float blended = output[i] + alpha[i] * (filtered[c][i] - output[i]);
                     output[i] = importance[i] > NO_WEIGHT ? blended : 0;
                 }
-                write_radiance(job, c, output, y, x0, n);
             }
             for (int c = 0; c < RGB * job->frame.parts; c++)
                 finish_part(job, c / RGB, c % RGB, filtered[FILTERED + c], y, x0, n);
@@ -2132,6 +2155,162 @@ static void run_filter(Job *job)
         if (job->pass == SPREADING - 1)
             run(job, split_rows, 0, height);
     }
+}
+
+/* --- Coarse corrections: neighbourhoods get the mean that their samples have -------------------------------------- */
+
+/* Adds n pixels of a row, from the first of a tile on, to the comparisons of the tiles that they lie in. */
+static void compare_row(const Job *job, int y, int x0, int n, Comparison *comparisons)
+{
+    const onespp *d = job->d;
+    float noisy[RGB][LINE], light[LINE], residual[LINE], motion[2][LINE];
+    const float *output = row_line(d, y, OUTPUT_LINES) + x0;
+    const float *importance = row_line(d, y, LEVEL_LINES + 3 * LEVELS - 1) + x0;
+    for (int c = 0; c < RGB; c++)
+        load_irradiance(noisy[c], &job->frame, c, y, x0, n);
+    for (int c = 0; c < 2; c++)
+        load(motion[c], &job->frame.motion, c, y, x0, n);
+    for (int i = 0; i < n; i++) {
+        float sample = luminance(noisy[0][i], noisy[1][i], noisy[2][i]);
+        float denoised = luminance(output[i], output[d->pitch + i], output[2 * d->pitch + i]);
+        sample = minf(maxf(job->exposure * sample, 0), MAX_EXPOSED);
+        denoised = minf(maxf(job->exposure * denoised, 0), MAX_EXPOSED);
+        residual[i] = (sample - denoised) / (denoised + COARSE_DARK);
+        light[i] = denoised / (denoised + COARSE_DARK);
+    }
+    for (int i = 0; i < n; i++) {
+        Comparison *tile = comparisons + i / TILE;
+        float surface = importance[i] > NO_WEIGHT ? 1.f : 0.f;
+        tile->residual += surface * residual[i];
+        tile->square += surface * residual[i] * residual[i];
+        tile->light += surface * light[i];
+        tile->motion[0] += surface * motion[0][i];
+        tile->motion[1] += surface * motion[1][i];
+        tile->pixels += surface;
+    }
+}
+
+/* The rows are those of tiles. */
+static void compare_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    (void)scratch;
+    int columns = tiles_along(job->frame.width);
+    for (int row = first; row < last; row++) {
+        Comparison *comparisons = job->d->comparisons + (ptrdiff_t)row * columns;
+        memset(comparisons, 0, sizeof *comparisons * (size_t)columns);
+        for (int y = row * TILE; y < mini((row + 1) * TILE, job->frame.height); y++)
+            for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK)
+                compare_row(job, y, x0, mini(CHUNK, job->frame.width - x0), comparisons + x0 / TILE);
+    }
+}
+
+/* The residual at a place between tiles, which is inside. */
+static Residual residual_at(const Residual *residuals, float x, float y, int columns, int rows)
+{
+    int left = (int)x, top = (int)y, right = mini(left + 1, columns - 1), bottom = mini(top + 1, rows - 1);
+    float fx = x - (float)left, fy = y - (float)top;
+    float weights[4] = {(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy};
+    Residual mean = {0, 0, 0};
+    for (int tap = 0; tap < 4; tap++) {
+        const Residual *there = residuals + (ptrdiff_t)(tap / 2 ? bottom : top) * columns + (tap % 2 ? right : left);
+        mean.sum += weights[tap] * there->sum;
+        mean.variance += weights[tap] * there->variance;
+        mean.length += weights[tap] * there->length;
+    }
+    return mean;
+}
+
+/* The mean of a tile's residual over the last frames, of which the past ones are where the tile's motion leads. */
+static Residual average(const Job *job, int x, int y, int columns, int rows)
+{
+    const Comparison *now = job->d->comparisons + (ptrdiff_t)y * columns + x;
+    Residual mean = {now->residual, now->square, 1};
+    float pixels = TILE * maxf(now->pixels, 1);
+    float then_x = (float)x + now->motion[0] / pixels, then_y = (float)y + now->motion[1] / pixels;
+    int is_inside = then_x >= -0.5f && then_x <= (float)columns - 0.5f && then_y >= -0.5f && then_y <= (float)rows - 0.5f;
+    if (!job->has_history || !is_inside)
+        return mean;
+    then_x = maxf(minf(then_x, (float)(columns - 1)), 0);
+    then_y = maxf(minf(then_y, (float)(rows - 1)), 0);
+    Residual past = residual_at(job->d->past.residuals, then_x, then_y, columns, rows);
+    mean.length = minf(past.length + 1, COARSE_LENGTH);
+    float newest = 1 / mean.length, kept = 1 - newest;
+    mean.sum = past.sum + newest * (now->residual - past.sum);
+    mean.variance = kept * kept * past.variance + newest * newest * now->square;
+    return mean;
+}
+
+/* What the tiles' light is multiplied by, in two steps; narrow neighbourhoods see what the wide ones leave. Tiles count by
+ * the frames that they know. */
+static void find_corrections(const Job *job)
+{
+    onespp *d = job->d;
+    int columns = tiles_along(job->frame.width), rows = tiles_along(job->frame.height), count = columns * rows;
+    static const int deviations[2] = {WIDE_DEVIATION, NARROW_DEVIATION};
+    for (int i = 0; i < count; i++) {
+        d->residuals[i] = average(job, i % columns, i / columns, columns, rows);
+        d->comparisons[i].gain = 1;
+    }
+    memcpy(d->next.residuals, d->residuals, sizeof(Residual) * (size_t)count);
+    for (int step = 0; step < 2; step++) {
+        for (int i = 0; i < count; i++) {
+            float gain = d->comparisons[i].gain, light = d->comparisons[i].light;
+            Residual known = d->residuals[i];
+            d->tiles[i].past = known.length * gain * light;
+            d->tiles[i].change = known.length * (known.sum - (gain - 1) * light);
+            d->tiles[i].variance = known.length * known.length * known.variance;
+        }
+        find_gains(d->tiles, d->row_tiles, rows, columns, deviations[step], COARSE_NOISE);
+        for (int i = 0; i < count; i++)
+            d->tiles[i].gain = d->comparisons[i].gain *= d->tiles[i].gain;
+    }
+}
+
+/* --- Output ------------------------------------------------------------------------------------------------------- */
+
+/* One colour of the denoised radiance. */
+static void write_radiance(const Job *job, int channel, const float *restrict gain, int y, int x0, int n)
+{
+    float divisor[LINE], emission[LINE];
+    const float *restrict output = row_line(job->d, y, OUTPUT_LINES + channel) + x0;
+    load_divisor(divisor, &job->frame, channel, y, x0, n);
+    load(emission, &job->frame.emission, channel, y, x0, n);
+    ptrdiff_t step = job->radiance.column;
+    float *to = job->radiance.data + job->radiance.channel * channel + job->radiance.row * y + step * x0;
+    for (int i = 0; i < n; i++)
+        to[i * step] = gain[i] * output[i] * divisor[i] + emission[i];
+}
+
+/* A colour of a part of the light: where no surface is, it stays as it is. */
+static void write_part(const Job *job, int part, int channel, const float *restrict gain, int y, int x0, int n)
+{
+    float divisor[LINE], noisy[LINE];
+    int is_light = part < job->frame.parts - job->frame.masks;
+    const float *restrict importance = row_line(job->d, y, LEVEL_LINES + 3 * LEVELS - 1) + x0;
+    const float *restrict output = part_line(job->d, y, part, PART_OUTPUT + channel) + x0;
+    const onespp_output *image = &job->frame.part[part].radiance;
+    float *to = image->data + image->channel * channel + image->row * y + image->column * x0;
+    load_divisor(divisor, &job->frame, channel, y, x0, n);
+    load(noisy, &job->frame.part[part].noisy, channel, y, x0, n);
+    for (int i = 0; i < n; i++) {
+        float light = (is_light ? gain[i] : 1) * output[i] * divisor[i];
+        to[i * image->column] = importance[i] > NO_WEIGHT ? light : noisy[i];
+    }
+}
+
+static void write_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    (void)scratch;
+    float gain[LINE];
+    for (int y = first; y < last; y++)
+        for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
+            int n = mini(CHUNK, job->frame.width - x0);
+            interpolate_gain(gain, job, job->d->tiles, TILE, y, x0, n);
+            for (int c = 0; c < RGB; c++)
+                write_radiance(job, c, gain, y, x0, n);
+            for (int c = 0; c < RGB * job->frame.parts; c++)
+                write_part(job, c / RGB, c % RGB, gain, y, x0, n);
+        }
 }
 
 /* --- The engine --------------------------------------------------------------------------------------------------- */
@@ -2232,13 +2411,17 @@ static int denoise(onespp *d, void *past, void *next, const onespp_frame *frame,
     set_default(&job.frame.roughness, &one);
     measure(&job);
     set_up_geometry(&job);
-    run(&job, reproject_rows, 0, blocks_along(frame->height));
+    int rows = blocks_along(frame->height), columns = blocks_along(frame->width);
+    run(&job, reproject_rows, 0, rows);
     if (job.has_history) {
-        find_gains(&job);
+        find_gains(d->changes, d->row_changes, rows, columns, GAIN_DEVIATION, GAIN_NOISE);
         run(&job, follow_rows, 0, frame->height);
     }
     run_network(&job);
     run_filter(&job);
+    run(&job, compare_rows, 0, tiles_along(frame->height));
+    find_corrections(&job);
+    run(&job, write_rows, 0, frame->height);
     remember_moment(d, frame);
     return ONESPP_OK;
 }

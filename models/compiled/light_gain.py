@@ -15,11 +15,11 @@ from models.operators import MAX_LUMINANCE
 TILE = 16  # px
 
 
-def between_tiles(size: int) -> tuple[Tensor, Tensor, Tensor]:
+def between_tiles(size: int, tile: int = TILE) -> tuple[Tensor, Tensor, Tensor]:
     """For `size` pixels in a row: which tiles have centres before and after each, and its place between them."""
-    place = ((torch.arange(size) + 0.5) / TILE - 0.5).clamp(min=0)
+    place = ((torch.arange(size) + 0.5) / tile - 0.5).clamp(min=0)
     before = place.long()
-    return before, (before + 1).clamp(max=(size - 1) // TILE), place - before
+    return before, (before + 1).clamp(max=(size - 1) // tile), place - before
 
 
 @jit_in_any_order

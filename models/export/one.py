@@ -4,6 +4,8 @@ Taps of its filters are slices, all in one tensor: exact in every engine, wherea
 pixels where engines shorten their inputs.
 """
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -12,12 +14,28 @@ from models.compiled.affinity import MIN_LOGIT
 from models.compiled.light_gain import TILE
 from models.compiled.one import SIDE_MULTIPLE
 from models.export.history import in_whole_blocks, updated_scale
-from models.export.step import Step, Warp, bounded, demodulation, image
+from models.export.step import (
+    TILE_COLUMNS,
+    TILE_ROWS,
+    Port,
+    Step,
+    Warp,
+    bounded,
+    demodulation,
+    image,
+    tiles_and_1,
+)
 from models.filters.neighbours import means_of, summands
+from models.history.coarse_light import COARSE_TILE, compared, correction_of
 from models.history.light_gain import at_pixels, changes, gain_of
 from models.networks.one import HISTORY, PATCH, WHOLE, Decoded, One, PixelInputs, carried, decode, input_channels
 from models.operators import MAX_IRRADIANCE, MIN_DIVISOR
 
+RESIDUAL = Port(
+    "residual",
+    (1, 3, TILE_ROWS, TILE_COLUMNS),
+    f"of tiles of {COARSE_TILE} px: the relative residual of denoised luminance, its variance, and frames; not warped",
+)
 COARSE_PADDING = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
 
 
@@ -43,6 +61,13 @@ def tile_sums(history: Tensor, noisy: Tensor, has_history: Tensor) -> Tensor:
     """
     padded = in_whole_blocks(torch.cat([history[:, :3], noisy, has_history], dim=1), TILE)
     return TILE**2 * F.avg_pool2d(changes(*padded.split([3, 3, 1], dim=1)), TILE)
+
+
+def compared_sums(noisy: Tensor, denoised: Tensor, exposure: Tensor, surface: Tensor, motion: Tensor) -> Tensor:
+    """Sums over tiles of models.history.coarse_light.compared; see tile_sums."""
+    padded = in_whole_blocks(torch.cat([noisy, denoised, surface, motion], dim=1), COARSE_TILE)
+    noisy, denoised, surface, motion = padded.split([3, 3, 1, 2], dim=1)
+    return COARSE_TILE**2 * F.avg_pool2d(compared(noisy, denoised, exposure, surface, motion), COARSE_TILE)
 
 
 def affinity_level(
@@ -114,7 +139,10 @@ class Coarsest(nn.Sequential):
 class OneStep(Step):
     """`one`. The denoiser is prepared for inference and must not be used afterwards."""
 
-    reads = ("noisy", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "camera_to_world", "samples")
+    reads = (
+        *("noisy", "emission", "albedo", "normal", "depth", "roughness", "mesh_id"),
+        *("motion", "camera_to_world", "samples"),
+    )
     history = image(
         "history",
         sum(HISTORY),
@@ -123,6 +151,9 @@ class OneStep(Step):
 
     def __init__(self, denoiser: One, warp: Warp):
         super().__init__(denoiser, warp)
+        self.carried = (*self.carried, replace(RESIDUAL, source="new_residual"))
+        self.inputs = (*self.images, *self.carried)
+        self.outputs = (*self.outputs, Port("new_residual", RESIDUAL.shape, "the next frame's residual"))
         self.trunk = denoiser.network
         self.trunk.enter = nn.Sequential(on_pixels(self.trunk.enter[0]), *[*self.trunk.enter][1:])
         self.trunk.detail = nn.Sequential(*map(pointwise, self.trunk.detail))
@@ -152,8 +183,14 @@ class OneStep(Step):
         head = resized(self.trunk(resized(channels, *whole)), *size) + self.trunk.detail(channels)
         decoded = Decoded(*decode(head, inputs, x["samples"]))
         images = carried(decoded, history, surface, exposure, affinity_level)
+        coarse = correction_of(
+            compared_sums(noisy, images[0], exposure, surface, x["motion"]),
+            x["residual"],
+            (tiles_and_1(size[0]) - 1, tiles_and_1(size[1]) - 1),
+        )
         return {
-            "radiance": images[0] * divisor + x["emission"],
+            "radiance": coarse.corrected(images[0]) * divisor + x["emission"],
+            "new_residual": coarse.residual,
             "new_history": torch.cat(images, dim=1),
             "new_scale": state,
         }

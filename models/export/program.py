@@ -16,7 +16,7 @@ from torch.export import Dim, ExportedProgram
 
 from datasets.frame import Frame
 from errors import BadInput
-from models.export.step import HEIGHT, MESHES, WIDTH, Step
+from models.export.step import HEIGHT, MESHES, TILE_COLUMNS, TILE_ROWS, WIDTH, Step
 from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 
@@ -54,7 +54,7 @@ def dynamic(step: Step) -> dict[str, dict[int, str]]:
 
 def trace(step: Step, frame: Frame) -> ExportedProgram:
     """The step as a graph. `frame` is an example of at least 2 x 2 pixels and one mesh."""
-    sizes = {HEIGHT: Dim(HEIGHT, min=2), WIDTH: Dim(WIDTH, min=2), MESHES: Dim(MESHES, min=2)}
+    sizes = {name: Dim(name, min=2) for name in (HEIGHT, WIDTH, MESHES, TILE_ROWS, TILE_COLUMNS)}
     shapes = {name: {axis: sizes[size] for axis, size in named.items()} for name, named in dynamic(step).items()}
     inputs = {**step.frame_inputs(frame), **step.initial_state(frame)}
     with torch.no_grad(), quiet():

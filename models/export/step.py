@@ -11,6 +11,7 @@ from datasets.channels import ALBEDO_FLOOR
 from datasets.frame import BOUNDED, MAX_MAGNITUDE, MAX_SURFACE, Frame
 from models.denoiser import Denoiser
 from models.export.history import GraphGBuffer, reprojected
+from models.history.coarse_light import COARSE_TILE
 from models.history.geometry import to_previous_camera
 
 Warp = Literal["inside", "outside"]
@@ -18,6 +19,8 @@ Warp = Literal["inside", "outside"]
 HEIGHT = "height"
 WIDTH = "width"
 MESHES = "meshes_and_1"
+TILE_ROWS = "tile_rows_and_1"
+TILE_COLUMNS = "tile_columns_and_1"
 PREVIOUS = "previous_"  # begins the names of what is the previous frame's
 
 
@@ -69,6 +72,11 @@ WARP_READS = ("mesh_id", "motion", "K", "camera_to_world", "to_previous_camera")
 SCALE = Port("scale", (4,), "running means of ln(luminance / 0.18) and ln(median depth), and frame counts of both")
 
 
+def tiles_and_1(side: int) -> int:
+    """How many tiles of a coarse correction cover a side of the image, and one more: tracers need to see two."""
+    return (side + 2 * COARSE_TILE - 1) // COARSE_TILE
+
+
 class Step(nn.Module):
     """One frame of a denoiser (B = 1) as a function of tensors by name.
 
@@ -94,7 +102,7 @@ class Step(nn.Module):
         history = replace(self.history, source="new_history", warped=warp == "outside")
         self.carried = (history, replace(SCALE, source="new_scale"), *previous)
         self.inputs = (*self.images, *self.carried)
-        self.outputs = (
+        self.outputs: tuple[Port, ...] = (
             image("radiance", 3, "denoised radiance including emission, linear RGB"),
             Port("new_history", self.history.shape, "the next frame's history"),
             Port("new_scale", SCALE.shape, "the next frame's scale"),
@@ -111,6 +119,7 @@ class Step(nn.Module):
     def initial_state(self, frame: Frame) -> dict[str, Tensor]:
         """The state before a sequence of frames of this one's size."""
         sizes = dict(zip((HEIGHT, WIDTH), frame.size, strict=True))
+        sizes |= {name: tiles_and_1(side) for name, side in zip((TILE_ROWS, TILE_COLUMNS), frame.size, strict=True)}
         shapes = ([size if isinstance(size, int) else sizes[size] for size in port.shape] for port in self.carried)
         return {p.name: torch.zeros(shape, dtype=p.dtype) for p, shape in zip(self.carried, shapes, strict=True)}
 

@@ -13,10 +13,10 @@ from models.compiled import light_gain as kernels
 from models.compiled.light_gain import TILE, between_tiles
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR, block_sums, image_luminance
 
-GAIN_RADIUS = 6  # tiles
-GAIN_DEVIATION = 2.0  # tiles, of the Gaussian that weights them
+REACH = 3  # deviations: the radius of Gaussians
+GAIN_DEVIATION = 2  # tiles, of the Gaussian that weights them
 GAIN_NOISE = 3.0  # standard errors of a neighbourhood's mean: smaller differences do not count
-MAX_GAIN = 4.0  # of history, a frame
+MAX_GAIN = 4.0  # of a neighbourhood, a frame
 
 
 def changes(history: Tensor, noisy: Tensor, has_history: Tensor) -> Tensor:
@@ -37,28 +37,34 @@ def tile_sums(history: Tensor, noisy: Tensor, has_history: Tensor) -> Tensor:
     return block_sums(changes(history, noisy, has_history), TILE)
 
 
-def gain_of(sums: Tensor) -> Tensor:
-    """What history is multiplied by in each tile, (B, 1, h, w), from `tile_sums`.
-
-    The change of a neighbourhood is shrunk by the square of its noise, as James and Stein shrink means (1961). Noise
-    is estimated from the changes themselves: the squared standard error of a sum of values d with weights w is Σ w² d²,
-    and for a Gaussian w half of Σ w d².
-    """
-    offsets = torch.arange(-GAIN_RADIUS, GAIN_RADIUS + 1, dtype=sums.dtype, device=sums.device)
-    weights = torch.exp(-offsets.square() / (2 * GAIN_DEVIATION**2))
+def gaussian_sums(tiles: Tensor, deviation: int) -> Tensor:
+    """Sums (B, C, h, w) of tiles around each, with the weights of a Gaussian, its own being 1; 0 outside the image."""
+    radius = REACH * deviation
+    offsets = torch.arange(-radius, radius + 1, dtype=tiles.dtype, device=tiles.device)
+    weights = torch.exp(-offsets.square() / (2 * deviation**2))
     rows, columns = weights.view(1, 1, -1, 1), weights.view(1, 1, 1, -1)
-    images = sums.flatten(0, 1)[:, None]
-    images = F.conv2d(F.conv2d(images, rows, padding=(GAIN_RADIUS, 0)), columns, padding=(0, GAIN_RADIUS))
-    past, change, square = images.view_as(sums).split(1, dim=1)
+    images = tiles.flatten(0, 1)[:, None]
+    images = F.conv2d(F.conv2d(images, rows, padding=(radius, 0)), columns, padding=(0, radius))
+    return images.view_as(tiles)
+
+
+def gain_of(sums: Tensor, deviation: int = GAIN_DEVIATION, noise: float = GAIN_NOISE) -> Tensor:
+    """What light is multiplied by in each tile, (B, 1, h, w), from `tile_sums`: of light, its change, and its variance.
+
+    The change of a neighbourhood is shrunk by the square of its noise, as James and Stein shrink means (1961): what is
+    below so many standard errors does not count. The squared standard error of a sum with weights w is Σ w² v for
+    values of variance v, and for a Gaussian w half of Σ w v; here v is the square of the change itself.
+    """
+    past, change, variance = gaussian_sums(sums, deviation).split(1, dim=1)
     size = change.abs().clamp(min=MIN_DIVISOR)
-    significance = (1 - GAIN_NOISE**2 / 2 * square / size / size).clamp(min=0)
+    significance = (1 - noise**2 / 2 * variance / size / size).clamp(min=0)
     return 1 + significance * (change / past.clamp(min=MIN_DIVISOR)).clamp(1 / MAX_GAIN - 1, MAX_GAIN - 1)
 
 
-def at_pixels(tiles: Tensor, height: int, width: int) -> Tensor:
-    """Tiles (B, 1, h, w), interpolated bilinearly between their centres: (B, 1, H, W)."""
+def at_pixels(tiles: Tensor, height: int, width: int, tile: int = TILE) -> Tensor:
+    """Tiles (B, 1, h, w) of `tile` px, interpolated bilinearly between their centres: (B, 1, H, W)."""
     for dim, size in ((-2, height), (-1, width)):
-        before, after, share = (each.to(tiles.device) for each in between_tiles(size))
+        before, after, share = (each.to(tiles.device) for each in between_tiles(size, tile))
         share = share[:, None] if dim == -2 else share
         tiles = torch.lerp(tiles.index_select(dim, before), tiles.index_select(dim, after), share)
     return tiles

@@ -1,4 +1,5 @@
-"""`one`: our own recurrent denoiser: convex kernels on irradiance, and validated history that follows the light."""
+"""`one`: our own recurrent denoiser: convex kernels on irradiance, validated history that follows the light, and the
+means of coarse neighbourhoods kept."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -32,6 +33,7 @@ from models.compiled.one import (
 from models.compiled.one_in_c import OneInC, StateInC
 from models.denoiser import NO_FLOAT16, Denoiser, State, matching_state
 from models.filters.neighbours import mesh_means, taps_3x3
+from models.history.coarse_light import CoarseLight, correct_coarsely
 from models.history.geometry import GBuffer
 from models.history.light_gain import follow_light
 from models.history.reprojection import reproject
@@ -79,7 +81,7 @@ class Trunk(nn.Module):
 class OneState(State):
     """Denoised and accumulated irradiance, the latter's effective length, and latent channels."""
 
-    output: Tensor  # (B, 3, H, W)
+    output: Tensor  # (B, 3, H, W), before the coarse correction
     accumulated: Tensor  # (B, 3, H, W)
     length: Tensor  # (B, 1, H, W), samples
     latent: Tensor  # (B, LATENT, H, W)
@@ -88,6 +90,7 @@ class OneState(State):
     alpha: Tensor  # (B, 2, H, W), of accumulation and output; for debugging
     part_output: Tensor  # of the P parts of the light, (B, 3 P, H, W)
     part_accumulated: Tensor
+    coarse: CoarseLight
 
     def pictures(self) -> dict[str, Tensor]:
         return {
@@ -95,6 +98,7 @@ class OneState(State):
             "accumulated": self.accumulated,
             "weight of the frame in accumulation": self.alpha[:, :1],
             "weight of the frame in output": self.alpha[:, 1:],
+            "coarse correction": self.coarse.corrected(torch.ones_like(self.length)),
         }
 
 
@@ -359,10 +363,18 @@ class One(Denoiser):
             before = None  # the parts would not add up to the whole
         surface = (frame.depth > 0).to(frame.depth)
         decoded, past, scale = self.decoded(frame, before, surface)
-        output, accumulated, length, latent = carried(decoded, past, surface, scale.exposure() * frame.gain)
+        exposure = scale.exposure() * frame.gain
+        output, accumulated, length, latent = carried(decoded, past, surface, exposure)
         images = output[:, :3], accumulated[:, :3], length, latent
         parts = output[:, 3:], accumulated[:, 3:]
-        return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach(), *parts)
+        noisy = self.noisy(frame, surface)
+        coarse = correct_coarsely(noisy, images[0], exposure, surface, frame.motion, before.coarse if before else None)
+        state = OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach(), *parts, coarse)
+        return coarse.corrected(images[0]), state
+
+    def noisy(self, frame: Frame, surface: Tensor) -> Tensor:
+        """The irradiance (B, 3, H, W) that is denoised."""
+        return frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
 
     def decoded(self, frame: Frame, before: OneState | None, surface: Tensor) -> tuple[Decoded, Tensor, RunningScale]:
         """What the network predicts, the reprojected history, of large images its output alone, and the running scale.
@@ -370,7 +382,7 @@ class One(Denoiser):
         The filter needs nothing else: what only the network reads is freed on return. Parts of the light, if there
         are any, follow the whole in the accumulation, which has the same weights, and in the history's output.
         """
-        noisy = frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
+        noisy = self.noisy(frame, surface)
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         history, part_history, has_history = fetched(before, frame, noisy, surface)
         decoded, past = self.decoded_frame(frame, scale, noisy, history, has_history)
@@ -435,5 +447,7 @@ class One(Denoiser):
         if isinstance(state, StateInC):
             assert state.parts is not None
             return state.parts
-        reflected = times_each(state.part_output, frame.divisor)
+        lights = state.part_output.shape[1] - 3 * frame.masks
+        light, masks = state.part_output[:, :lights], state.part_output[:, lights:]
+        reflected = times_each(torch.cat([state.coarse.corrected(light), masks], dim=1), frame.divisor)
         return reflected if frame.surface is None else torch.where(frame.surface > 0, reflected, frame.parts)

@@ -5,10 +5,11 @@ import torch
 from torch import Tensor
 
 from models import compiled
+from models.history.coarse_light import COARSE_DEVIATIONS
 from models.history.light_gain import (
     GAIN_DEVIATION,
-    GAIN_RADIUS,
     MAX_GAIN,
+    REACH,
     TILE,
     at_pixels,
     follow_light,
@@ -94,10 +95,12 @@ def test_only_light_is_multiplied():
     torch.testing.assert_close(followed[:, :6], history[:, :6] * expected)
 
 
-def test_the_squared_standard_error_of_a_gaussian_sum():
+@pytest.mark.parametrize("deviation", [GAIN_DEVIATION, *COARSE_DEVIATIONS])
+def test_the_squared_standard_error_of_a_gaussian_sum(deviation):
     """Of values with variance 1: the sum of squared weights is half of the sum of weights, here and in the limit."""
-    offsets = torch.arange(-GAIN_RADIUS, GAIN_RADIUS + 1, dtype=torch.float64)
-    weights = torch.exp(-offsets.square() / (2 * GAIN_DEVIATION**2))
+    radius = REACH * deviation
+    offsets = torch.arange(-radius, radius + 1, dtype=torch.float64)
+    weights = torch.exp(-offsets.square() / (2 * deviation**2))
     weights = weights[:, None] * weights
     assert abs(weights.square().sum() / weights.sum() - 0.5) < 0.002
 
