@@ -34,7 +34,8 @@ from models.operators import MAX_IRRADIANCE, MIN_DIVISOR
 RESIDUAL = Port(
     "residual",
     (1, 3, TILE_ROWS, TILE_COLUMNS),
-    f"of tiles of {COARSE_TILE} px: the relative residual of denoised luminance, its variance, and frames; not warped",
+    f"of tiles of {COARSE_TILE} px, (height + {2 * COARSE_TILE - 1}) // {COARSE_TILE} rows, columns likewise: relative "
+    "residual of denoised luminance, its variance, how many frames; not reprojected",
 )
 COARSE_PADDING = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
 
@@ -190,7 +191,7 @@ class OneStep(Step):
         )
         return {
             "radiance": coarse.corrected(images[0]) * divisor + x["emission"],
-            "new_residual": coarse.residual,
             "new_history": torch.cat(images, dim=1),
             "new_scale": state,
+            "new_residual": coarse.residual,
         }

@@ -69,6 +69,7 @@ def counted(kinds: Iterable[str], branches: dict[str, int]) -> dict[str, Any]:
 
 def write_onnx(program: ExportedProgram, step: Step, path: Path) -> dict[str, Any]:
     """Write one file, weights included. Returns its operators, see `counted`."""
+    from onnxscript import ir
     from onnxscript.optimizer import remove_unused_nodes
 
     with quiet():
@@ -82,6 +83,8 @@ def write_onnx(program: ExportedProgram, step: Step, path: Path) -> dict[str, An
             verbose=False,
         )
         assert written is not None
+        for value, port in zip(written.model.graph.outputs, step.outputs, strict=True):
+            value.shape = ir.Shape(port.shape)  # with its own names for sizes, not formulas of others
         remove_unused_nodes(written.model)  # the exporter leaves constants in branches, of which runtimes warn
         written.save(path, external_data=False)
     nodes = list(written.model.graph)

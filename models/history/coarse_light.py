@@ -42,7 +42,7 @@ def compared(noisy: Tensor, denoised: Tensor, exposure: Tensor, surface: Tensor,
     is relative to the denoised one, since bright pixels of a neighbourhood must not outweigh the others; but those that
     are displayed dark count less.
     """
-    exposed = (image_luminance(exposure * image).clamp(min=0, max=MAX_EXPOSED) for image in (noisy, denoised))
+    exposed = (image_luminance(exposure * image).clamp(0.0, MAX_EXPOSED) for image in (noisy, denoised))
     sample, light = exposed
     residual = (sample - light) / (light + COARSE_DARK)
     return surface * torch.cat(
