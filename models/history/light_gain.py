@@ -13,7 +13,7 @@ from models.compiled import light_gain as kernels
 from models.compiled.light_gain import TILE, between_tiles
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR, block_sums, image_luminance
 
-REACH = 3  # deviations: the radius of Gaussians
+GAUSSIAN_REACH = 3  # deviations: the radius of Gaussians
 GAIN_DEVIATION = 2  # tiles, of the Gaussian that weights them
 GAIN_NOISE = 3.0  # standard errors of a neighbourhood's mean: smaller differences do not count
 MAX_GAIN = 4.0  # of a neighbourhood, a frame
@@ -39,7 +39,7 @@ def tile_sums(history: Tensor, noisy: Tensor, has_history: Tensor) -> Tensor:
 
 def gaussian_sums(tiles: Tensor, deviation: int) -> Tensor:
     """Sums (B, C, h, w) of tiles around each, with the weights of a Gaussian, its own being 1; 0 outside the image."""
-    radius = REACH * deviation
+    radius = GAUSSIAN_REACH * deviation
     offsets = torch.arange(-radius, radius + 1, dtype=tiles.dtype, device=tiles.device)
     weights = torch.exp(-offsets.square() / (2 * deviation**2))
     rows, columns = weights.view(1, 1, -1, 1), weights.view(1, 1, 1, -1)

@@ -8,8 +8,8 @@ from models import compiled
 from models.history.coarse_light import COARSE_DEVIATIONS
 from models.history.light_gain import (
     GAIN_DEVIATION,
+    GAUSSIAN_REACH,
     MAX_GAIN,
-    REACH,
     TILE,
     at_pixels,
     follow_light,
@@ -98,7 +98,7 @@ def test_only_light_is_multiplied():
 @pytest.mark.parametrize("deviation", [GAIN_DEVIATION, *COARSE_DEVIATIONS])
 def test_the_squared_standard_error_of_a_gaussian_sum(deviation):
     """Of values with variance 1: the sum of squared weights is half of the sum of weights, here and in the limit."""
-    radius = REACH * deviation
+    radius = GAUSSIAN_REACH * deviation
     offsets = torch.arange(-radius, radius + 1, dtype=torch.float64)
     weights = torch.exp(-offsets.square() / (2 * deviation**2))
     weights = weights[:, None] * weights
