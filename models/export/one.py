@@ -4,8 +4,6 @@ Taps of its filters are slices, all in one tensor: exact in every engine, wherea
 pixels where engines shorten their inputs.
 """
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -31,12 +29,6 @@ from models.history.light_gain import at_pixels, changes, gain_of
 from models.networks.one import HISTORY, PATCH, WHOLE, Decoded, One, PixelInputs, carried, decode, input_channels
 from models.operators import MAX_IRRADIANCE, MIN_DIVISOR
 
-RESIDUAL = Port(
-    "residual",
-    (1, 3, TILE_ROWS, TILE_COLUMNS),
-    f"of tiles of {COARSE_TILE} px, (height + {2 * COARSE_TILE - 1}) // {COARSE_TILE} rows, columns likewise: relative "
-    "residual of denoised luminance, its variance, how many frames; not reprojected",
-)
 COARSE_PADDING = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
 
 
@@ -150,11 +142,17 @@ class OneStep(Step):
         "output and accumulated irradiance, linear RGB each; effective length of the accumulation in samples; latent",
     )
 
+    other_state = (
+        Port(
+            "residual",
+            (1, 3, TILE_ROWS, TILE_COLUMNS),
+            f"of tiles of {COARSE_TILE} px, (height + {2 * COARSE_TILE - 1}) // {COARSE_TILE} rows, columns likewise: "
+            "relative residual of denoised luminance, its variance, how many frames; not reprojected",
+        ),
+    )
+
     def __init__(self, denoiser: One, warp: Warp):
         super().__init__(denoiser, warp)
-        self.carried = (*self.carried, replace(RESIDUAL, source="new_residual"))
-        self.inputs = (*self.images, *self.carried)
-        self.outputs = (*self.outputs, Port("new_residual", RESIDUAL.shape, "the next frame's residual"))
         self.trunk = denoiser.network
         self.trunk.enter = nn.Sequential(on_pixels(self.trunk.enter[0]), *[*self.trunk.enter][1:])
         self.trunk.detail = nn.Sequential(*map(pointwise, self.trunk.detail))

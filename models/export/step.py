@@ -85,6 +85,7 @@ class Step(nn.Module):
 
     reads: ClassVar[tuple[str, ...]]  # names of the FRAME_PORTS that it takes, apart from those of the warp
     history: ClassVar[Port]
+    other_state: ClassVar[tuple[Port, ...]] = ()  # beside it, never reprojected
 
     def __init__(self, denoiser: Denoiser, warp: Warp):
         super().__init__()
@@ -100,12 +101,12 @@ class Step(nn.Module):
             if port.name in GraphGBuffer._fields and warp == "inside"
         )
         history = replace(self.history, source="new_history", warped=warp == "outside")
-        self.carried = (history, replace(SCALE, source="new_scale"), *previous)
+        others = [replace(port, source=f"new_{port.name}") for port in (SCALE, *self.other_state)]
+        self.carried = (history, *others, *previous)
         self.inputs = (*self.images, *self.carried)
-        self.outputs: tuple[Port, ...] = (
+        self.outputs = (
             image("radiance", 3, "denoised radiance including emission, linear RGB"),
-            Port("new_history", self.history.shape, "the next frame's history"),
-            Port("new_scale", SCALE.shape, "the next frame's scale"),
+            *(Port(port.source, port.shape, f"the next frame's {port.name}") for port in (history, *others)),
         )
 
     def forward(self, x: dict[str, Tensor]) -> dict[str, Tensor]:

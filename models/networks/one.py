@@ -1,5 +1,4 @@
-"""`one`: our own recurrent denoiser: convex kernels on irradiance, validated history that follows the light, and the
-means of coarse neighbourhoods kept."""
+"""`one`: our own recurrent denoiser: convex kernels, history that follows the light, and a coarse correction."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -362,27 +361,24 @@ class One(Denoiser):
         if before and before.part_output.shape[1] != 3 * frame.part_count:
             before = None  # the parts would not add up to the whole
         surface = (frame.depth > 0).to(frame.depth)
-        decoded, past, scale = self.decoded(frame, before, surface)
+        noisy = frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
+        decoded, past, scale = self.decoded(frame, before, noisy, surface)
         exposure = scale.exposure() * frame.gain
         output, accumulated, length, latent = carried(decoded, past, surface, exposure)
         images = output[:, :3], accumulated[:, :3], length, latent
         parts = output[:, 3:], accumulated[:, 3:]
-        noisy = self.noisy(frame, surface)
         coarse = correct_coarsely(noisy, images[0], exposure, surface, frame.motion, before.coarse if before else None)
         state = OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach(), *parts, coarse)
         return coarse.corrected(images[0]), state
 
-    def noisy(self, frame: Frame, surface: Tensor) -> Tensor:
-        """The irradiance (B, 3, H, W) that is denoised."""
-        return frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
-
-    def decoded(self, frame: Frame, before: OneState | None, surface: Tensor) -> tuple[Decoded, Tensor, RunningScale]:
+    def decoded(
+        self, frame: Frame, before: OneState | None, noisy: Tensor, surface: Tensor
+    ) -> tuple[Decoded, Tensor, RunningScale]:
         """What the network predicts, the reprojected history, of large images its output alone, and the running scale.
 
         The filter needs nothing else: what only the network reads is freed on return. Parts of the light, if there
         are any, follow the whole in the accumulation, which has the same weights, and in the history's output.
         """
-        noisy = self.noisy(frame, surface)
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         history, part_history, has_history = fetched(before, frame, noisy, surface)
         decoded, past = self.decoded_frame(frame, scale, noisy, history, has_history)
