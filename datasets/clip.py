@@ -49,19 +49,33 @@ class ClipKind(NamedTuple):
         return ClipKind(0 if still else int(match[1]), still, int(match[2] or 1))
 
 
-def visible_channel(name: str, stored: Container[str], read: Callable[[str], NDArray[Any]]) -> NDArray[Any]:
+def visible_channel(
+    name: str, stored: Container[str], read: Callable[[str], NDArray[Any]], meshes: int
+) -> NDArray[Any]:
     """A channel (..., H, W, C), in mirrors of the surfaces that these show, if the `stored` channels describe them.
 
     All motion in a mirror is that of what the mirror shows, as if it stood behind the mirror. The renderer's gradient
-    is of the mirror itself: there it counts as 0.
+    is of the mirror itself: there it counts as 0. Ids of the meshes that a mirror shows are higher by `meshes`, their
+    number: the light of a surface that is seen directly is no history of the same surface in a mirror or behind glass.
     """
+
+    def in_mirror() -> NDArray[np.bool_]:
+        return read(MIRRORED["depth"]) != read("depth")
+
     if MIRRORED.get(name) in stored:
-        return read(MIRRORED[name])
+        shown = read(MIRRORED[name])
+        return shown + np.int32(meshes) * (in_mirror() & (shown > 0)) if name == "mesh_id" else shown
     own = read(name)
     if not CHANNELS[name].is_temporal or MIRRORED["motion"] not in stored:
         return own
-    in_mirror = read(MIRRORED["depth"]) != read("depth")
-    return np.where(in_mirror, 0 if CHANNELS[name].kind == "gradient" else read(MIRRORED["motion"]), own)
+    return np.where(in_mirror(), 0 if CHANNELS[name].kind == "gradient" else read(MIRRORED["motion"]), own)
+
+
+def visible_view(view: View, stored: Container[str]) -> View:
+    """A view with poses for the mesh ids of `visible_channel`."""
+    if MIRRORED["mesh_id"] not in stored:
+        return view
+    return view._replace(object_to_world=np.concatenate([view.object_to_world] * 2))
 
 
 def second_layer_of(names: Iterable[str], stored: Container[str]) -> list[str]:
@@ -178,7 +192,8 @@ class Clip:
         self, channel: str, frame: int, window: ImageWindow = WHOLE_IMAGE, realisation: int = 0
     ) -> NDArray[Any]:
         """As `read`, but in mirrors of what these show: the input of denoisers. See `visible_channel`."""
-        return visible_channel(channel, self.layers, lambda name: self.read(name, frame, window, realisation))
+        meshes = self.map("object_to_world").shape[1]
+        return visible_channel(channel, self.layers, lambda name: self.read(name, frame, window, realisation), meshes)
 
     def read_blended(self, channel: str, frame: int) -> NDArray[Any]:
         """As `read_visible`, but of smooth glass the mean of both layers by probability, which OIDN asks for."""
@@ -193,6 +208,10 @@ class Clip:
         """The camera and the poses of all meshes in one frame."""
         return View._make(np.array(self.map(name)[frame]) for name in View._fields)
 
+    def visible_view(self, frame: int) -> View:
+        """The same with poses for the mesh ids of `read_visible`."""
+        return visible_view(self.view(frame), self.layers)
+
     def motion_to(
         self, frame: int, other: int, window: ImageWindow = WHOLE_IMAGE, read: Callable[..., NDArray[Any]] | None = None
     ) -> NDArray[np.float32]:
@@ -204,7 +223,8 @@ class Clip:
         pixels = pixel_centres(self.height, self.width)[window]
         depth = read("depth", frame, window)[..., 0].astype(np.float64)
         mesh_id = read("mesh_id", frame, window)[..., 0]
-        return motion_vectors(pixels, depth, mesh_id, self.view(frame), self.view(other)).astype(np.float32)
+        views = self.visible_view(frame), self.visible_view(other)
+        return motion_vectors(pixels, depth, mesh_id, *views).astype(np.float32)
 
     def noisy(self, frame: int, realisation: int = 0) -> NDArray[np.float32]:
         """Noisy radiance (H, W, 3): emission + direct + indirect."""

@@ -311,8 +311,8 @@ def read_frame(
         tensors[name] = to_tensor(array, has_buffers=channel.has_buffers)
     return Frame(
         tensors,
-        now=Cameras.of(clip.view(index), window),
-        previous=Cameras.of(clip.view(previous), window),
+        now=Cameras.of(clip.visible_view(index), window),
+        previous=Cameras.of(clip.visible_view(previous), window),
         source=str(clip.path),
         spp=torch.full((1, 1, 1, 1), float(clip.facts["noisy_spp"])),
     )

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from datasets.cameras import Cameras
 from datasets.channels import CHANNELS
-from datasets.clip import second_layer_of, visible_channel
+from datasets.clip import second_layer_of, visible_channel, visible_view
 from datasets.exr import FACTS_ATTRIBUTE, channels_in
 from datasets.frame import Frame, to_tensor
 from denoise.cameras import in_the_world, is_own_space, view_of_header, view_of_positions
@@ -308,10 +308,11 @@ class OwnFrameBuilder:
     def build(self, image: ExrImage) -> tuple[Frame, int]:
         """The next Frame, and how many pixels were not finite. A channel that was not exported is missing in it."""
         facts: dict[str, Any] = json.loads(image.header[FACTS_ATTRIBUTE])
-        view = View._make(np.array(facts[key]) for key in View._fields)
         arrays = channels_in({name: channel.pixels for name, channel in image.channels.items()})
+        own_view = View._make(np.array(facts[key]) for key in View._fields)
+        view, meshes = visible_view(own_view, arrays), len(own_view.object_to_world)
         names = list(dict.fromkeys([*self.reads, *second_layer_of(self.reads, arrays)]))
-        visible = {name: visible_channel(name, arrays, arrays.__getitem__) for name in names if name in arrays}
+        visible = {name: visible_channel(name, arrays, arrays.__getitem__, meshes) for name in names if name in arrays}
         before = self.view if self.view is not None else view
         self.view = view
         frame = frame_of(visible, names, view, before, str(image.path), float(facts["noisy_spp"]))

@@ -109,6 +109,7 @@ enum {
 #define GAIN_NOISE 3.f /* standard errors: smaller changes of light do not count */
 #define COARSE_NOISE 2.f /* the same of residuals */
 #define COARSE_DARK 0.3f /* exposed luminance: residuals of what is darker count less than relative ones */
+#define COARSE_LEAST 0 /* gain: where no sample has any light, it is black */
 #define COARSE_LENGTH 4.f /* frames that residuals are averaged over at most */
 #define MAX_GAIN 4.f /* of a neighbourhood, a frame */
 #define MIN_CHANGE 1e-30f /* of sums of luminance, to divide by */
@@ -1142,19 +1143,20 @@ static Change sum_around(
     return sum;
 }
 
-/* What light is multiplied by where its surroundings have changed: the ratio, shrunk by the noise of the change, which
- * counts from so many standard errors on. The squared standard error of a sum with weights w is that of w^2 v for values
- * of variance v, for a Gaussian w half that of w v. */
-static float gain_of(const Change *around, float errors)
+/* What light is multiplied by where its surroundings have changed: the ratio, from `least` to MAX_GAIN, shrunk by the
+ * noise of the change, which counts from so many standard errors on. The squared standard error of a sum with weights w is
+ * that of w^2 v for values of variance v, for a Gaussian w half that of w v. */
+static float gain_of(const Change *around, float errors, float least)
 {
     float size = maxf(fabsf(around->change), MIN_CHANGE);
     float noise = errors * errors / 2 * around->variance / size / size;
-    float relative = maxf(minf(around->change / maxf(around->past, MIN_CHANGE), MAX_GAIN - 1), 1 / MAX_GAIN - 1);
+    float relative = maxf(minf(around->change / maxf(around->past, MIN_CHANGE), MAX_GAIN - 1), least - 1);
     return 1 + maxf(1 - noise, 0) * relative;
 }
 
 /* The gain of each of rows * columns squares; `sums` has room for as many. */
-static void find_gains(Change *changes, Change *sums, int rows, int columns, int deviation, float errors)
+static void find_gains(
+    Change *changes, Change *sums, int rows, int columns, int deviation, float errors, float least)
 {
     float weights[MAX_GAUSSIAN];
     int radius = REACH * deviation;
@@ -1166,7 +1168,7 @@ static void find_gains(Change *changes, Change *sums, int rows, int columns, int
         sums[i] = sum_around(changes + i / columns * columns, i % columns, columns, 1, weights, radius);
     for (int i = 0; i < rows * columns; i++) {
         Change around = sum_around(sums + i % columns, i / columns, rows, columns, weights, radius);
-        changes[i].gain = gain_of(&around, errors);
+        changes[i].gain = gain_of(&around, errors, least);
     }
 }
 
@@ -2260,7 +2262,7 @@ static void find_corrections(const Job *job)
             d->tiles[i].change = known.length * (known.sum - (gain - 1) * light);
             d->tiles[i].variance = known.length * known.length * known.variance;
         }
-        find_gains(d->tiles, d->row_tiles, rows, columns, deviations[step], COARSE_NOISE);
+        find_gains(d->tiles, d->row_tiles, rows, columns, deviations[step], COARSE_NOISE, COARSE_LEAST);
         for (int i = 0; i < count; i++)
             d->tiles[i].gain = d->comparisons[i].gain *= d->tiles[i].gain;
     }
@@ -2414,7 +2416,7 @@ static int denoise(onespp *d, void *past, void *next, const onespp_frame *frame,
     int rows = blocks_along(frame->height), columns = blocks_along(frame->width);
     run(&job, reproject_rows, 0, rows);
     if (job.has_history) {
-        find_gains(d->changes, d->row_changes, rows, columns, GAIN_DEVIATION, GAIN_NOISE);
+        find_gains(d->changes, d->row_changes, rows, columns, GAIN_DEVIATION, GAIN_NOISE, 1 / MAX_GAIN);
         run(&job, follow_rows, 0, frame->height);
     }
     run_network(&job);

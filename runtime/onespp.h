@@ -90,7 +90,8 @@ typedef struct {
     onespp_image depth;     /* 1: distance along the viewing axis; 0 for background */
     onespp_image roughness; /* 1, optional: GGX alpha; 1 for diffuse surfaces and background */
     onespp_image motion;    /* 2: x and y from the pixel to where its surface was in the previous frame, in pixels */
-    onespp_ids mesh_id;     /* optional: number of the mesh from 1 on; 0 for background. By default one for all */
+    onespp_ids mesh_id;     /* optional: number of the mesh from 1 on; 0 for background. By default one for all. Meshes
+                             * described as mirrors and glass show them need numbers of their own there */
 
     double K[9];                   /* intrinsics; of these the focal lengths and the centre are used */
     double camera_to_world[16];    /* rigid */

@@ -19,6 +19,7 @@ COARSE_TILE = 8  # px
 COARSE_DEVIATIONS = (4, 1)  # tiles, of the Gaussians that weight them: a neighbourhood after the other
 COARSE_NOISE = 2.0  # standard errors of a neighbourhood's mean: smaller residuals do not count
 COARSE_DARK = 0.3  # exposed luminance: residuals of what is darker count less than relative ones
+COARSE_LEAST = 0.0  # gain: where no sample has any light, it is black
 COARSE_LENGTH = 4.0  # frames that residuals are averaged over at most
 
 
@@ -98,7 +99,7 @@ def coarse_gain(residual: Tensor, light: Tensor) -> Tensor:
     for deviation in COARSE_DEVIATIONS:
         rest = total - (gain - 1) * light
         sums = torch.cat([length * gain * light, length * rest, length.square() * variance], dim=1)
-        gain = gain * gain_of(sums, deviation, COARSE_NOISE)
+        gain = gain * gain_of(sums, deviation, COARSE_NOISE, COARSE_LEAST)
     return gain
 
 

@@ -17,6 +17,7 @@ GAUSSIAN_REACH = 3  # deviations: the radius of Gaussians
 GAIN_DEVIATION = 2  # tiles, of the Gaussian that weights them
 GAIN_NOISE = 3.0  # standard errors of a neighbourhood's mean: smaller differences do not count
 MAX_GAIN = 4.0  # of a neighbourhood, a frame
+MIN_GAIN = 1 / MAX_GAIN
 
 
 def changes(history: Tensor, noisy: Tensor, has_history: Tensor) -> Tensor:
@@ -48,7 +49,9 @@ def gaussian_sums(tiles: Tensor, deviation: int) -> Tensor:
     return images.view_as(tiles)
 
 
-def gain_of(sums: Tensor, deviation: int = GAIN_DEVIATION, noise: float = GAIN_NOISE) -> Tensor:
+def gain_of(
+    sums: Tensor, deviation: int = GAIN_DEVIATION, noise: float = GAIN_NOISE, least: float = MIN_GAIN
+) -> Tensor:
     """What light is multiplied by in each tile, (B, 1, h, w), from `tile_sums`: of light, its change, and its variance.
 
     The change of a neighbourhood is shrunk by the square of its noise, as James and Stein shrink means (1961): what is
@@ -58,7 +61,7 @@ def gain_of(sums: Tensor, deviation: int = GAIN_DEVIATION, noise: float = GAIN_N
     past, change, variance = gaussian_sums(sums, deviation).split(1, dim=1)
     size = change.abs().clamp(min=MIN_DIVISOR)
     significance = (1 - noise**2 / 2 * variance / size / size).clamp(min=0)
-    return 1 + significance * (change / past.clamp(min=MIN_DIVISOR)).clamp(1 / MAX_GAIN - 1, MAX_GAIN - 1)
+    return 1 + significance * (change / past.clamp(min=MIN_DIVISOR)).clamp(least - 1, MAX_GAIN - 1)
 
 
 def at_pixels(tiles: Tensor, height: int, width: int, tile: int = TILE) -> Tensor:

@@ -58,7 +58,7 @@ def page(clip: Clip, frames: int) -> str:
         "width": clip.width,
         "height": clip.height,
         "samples": clip.facts["noisy_spp"],
-        "meshes": clip.view(0).object_to_world.shape[0],
+        "meshes": clip.visible_view(0).object_to_world.shape[0],
         "exposure": clip.exposure,
         "module": deflated(module()),
         "frames": [page_frame(clip, index) for index in range(frames)],

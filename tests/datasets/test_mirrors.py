@@ -39,6 +39,9 @@ def test_the_input_of_denoisers_is_what_mirrors_show(clip):
     stored = {name: planes[name] for name in VISIBLE}
     shown = {name: planes[mirrored] for name, mirrored in MIRRORED.items()}
     picture = stored["mesh_id"][0] == 1
+    meshes = clip.view(LAST).object_to_world.shape[0]
+    assert meshes >= stored["mesh_id"].max()
+    shown["mesh_id"] += meshes * (picture & (shown["mesh_id"] > 0))
     for name in MIRRORED:
         np.testing.assert_array_equal(frame.channel(name)[0], shown[name], err_msg=name)
     for name in OTHER_MOTION:
@@ -51,6 +54,16 @@ def test_the_input_of_denoisers_is_what_mirrors_show(clip):
     for name in ("emission", "direct"):
         np.testing.assert_array_equal(frame.channel(name)[0], stored[name], err_msg=name)
     assert picture.mean() > 0.4 and (frame.mesh_id[0, 0].numpy()[picture] != 1).all()
+
+
+def test_what_is_seen_directly_is_no_history_of_the_same_surface_in_a_mirror(clip):
+    frame = read_frame(clip, LAST, ("mesh_id",))
+    poses, ids = frame.now.object_to_world[0], frame.mesh_id[0, 0].long()
+    own, shown = (torch.from_numpy(np.int64(clip.read(name, LAST)[..., 0])) for name in ("mesh_id", "mirrored_mesh_id"))
+    in_both = np.intersect1d(ids[(own == 1) & (shown > 0)], ids[own > 1])
+    assert in_both.size == 0 and np.intersect1d(shown[own == 1], own[own > 1]).size > 0
+    here = ids > 0
+    torch.testing.assert_close(poses[ids[here] - 1], torch.from_numpy(clip.view(LAST).object_to_world)[shown[here] - 1])
 
 
 def test_motion_to_any_frame_is_that_of_visible_surfaces(clip):

@@ -157,6 +157,22 @@ def test_what_does_not_move_has_no_flow(package):
     np.testing.assert_allclose(flow, 0, atol=1e-9)
 
 
+def test_shapes_in_mirrors_have_numbers_and_poses_of_their_own(package):
+    scene = build_scene("extremes-mirrors", 0, 4)
+    stage = Stage(scene, HEIGHT, WIDTH)
+    view = stage.view(0)
+    sensor = sensor_at(view.camera_to_world, np.degrees(2 * np.arctan(WIDTH / 2 / abs(view.K[0, 0]))))
+    first = channels(stage.mitsuba_scene, sensor, GUIDES_ALONE)
+    found = channels(stage.mitsuba_scene, sensor, GUIDES_ALONE | {"look_through": True})
+    is_first = first["depth"] == found["depth"]
+    poses = np.random.default_rng(0).normal(size=(len(scene.shapes), 4, 4))
+    shapes, visible_poses = package.denoiser.visible_shapes(found, poses)
+    assert (shapes == found["shape"])[is_first].all() and (shapes > len(poses))[~is_first].mean() > 0.9
+    hit = shapes > 0
+    same = visible_poses[shapes[hit].astype(int) - 1] == poses[found["shape"][hit].astype(int) - 1]
+    assert same.all() and 0.05 < is_first.mean() < 0.95
+
+
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:
     displayed = [np.clip(each, 0, 1) ** (1 / 2.2) for each in (image, reference)]
     return -10 * np.log10(np.mean((displayed[0] - displayed[1]) ** 2))

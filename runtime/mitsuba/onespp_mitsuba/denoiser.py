@@ -13,6 +13,20 @@ from .motion import Snapshot, flow_between, pose_step
 # Where there is no depth: all is far away, in the camera space of each frame, and normals alone tell surfaces apart.
 FAR_AWAY = {"K": np.diag([-1e9, -1e9, 1.0]), "camera_to_world": np.eye(4)}
 TOWARDS_VIEWER = (0.0, 0.0, -1.0)
+MOST_SHAPES = 1 << 16  # where none moves
+
+
+def visible_shapes(images: dict[str, Image], poses: Array) -> tuple[Image | None, Array]:
+    """Numbers of the shapes that pixels show, and their poses (M, 4, 4).
+
+    Shapes in mirrors and behind glass, of which there is no primitive, have numbers of their own: the light of a shape
+    that is seen directly is no history of the same shape in a mirror.
+    """
+    shapes = images.get("shape")
+    if shapes is None or "primitive" not in images:
+        return shapes, poses
+    is_shown = (images["primitive"] == 0) & (shapes > 0)
+    return shapes + (len(poses) or MOST_SHAPES) * is_shown, np.concatenate([poses, poses])
 
 
 class Denoiser:
@@ -102,7 +116,9 @@ class Denoiser:
         images = to_images({"albedo": albedo, "normals": normals, "flow": flow, **guides}, size)
         now = self.snapshot(images, sensor, scene)
         motion, poses = self.motion(images, now), self.moved_poses(now)
-        runtime = self.runtime if len(poses) <= self.runtime.max_meshes else self.with_room(len(poses))
+        shapes, visible_poses = visible_shapes(images, poses)
+        count = len(visible_poses)
+        runtime = self.runtime if count <= self.runtime.max_meshes else self.with_room(count)
         rgb = np.broadcast_to(light[..., :3], (*size, 3))
         normals, depth = self.surface(images, now, to_sensor)
         emission = np.minimum(images["emission"], rgb) if "emission" in images else np.float32(0)
@@ -114,8 +130,8 @@ class Denoiser:
             motion,
             emission=np.where(depth.reshape(*size, 1) > 0, emission, rgb),  # background stays as it is
             roughness=images.get("roughness"),
-            mesh_id=images.get("shape"),
-            object_to_world=poses if len(poses) else None,
+            mesh_id=shapes,
+            object_to_world=visible_poses if count else None,
             samples=samples,
             reset=self.is_first or not self.temporal,
             **({"K": now.camera.K, "camera_to_world": now.camera.camera_to_world} if now else FAR_AWAY),

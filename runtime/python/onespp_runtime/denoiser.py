@@ -106,7 +106,8 @@ class Denoiser:
         - indirect (H, W, 3): noisy radiance after more than one bounce, added to the color. None: the color has it
         - emission (H, W, 3): light sources seen directly, which the color lacks; added to the result. None: 0
         - roughness (H, W) or (H, W, 1): GGX alpha in [0, 1]; 1 for diffuse surfaces and background. None: 1
-        - mesh_id (H, W) or (H, W, 1): number of the pixel's mesh from 1 on; 0 for background. None: one for all
+        - mesh_id (H, W) or (H, W, 1): number of the pixel's mesh from 1 on; 0 for background. None: one for all.
+          Meshes described as mirrors and glass show them need numbers of their own there
         - object_to_world (M, 4, 4): rigid; poses of meshes 1 to M, of which there are at most max_meshes. Meshes
           without a pose do not move
         - samples: per pixel, in the color, from 1e-3 to 1e9; 1 where unknown
