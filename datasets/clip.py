@@ -192,7 +192,7 @@ class Clip:
         self, channel: str, frame: int, window: ImageWindow = WHOLE_IMAGE, realisation: int = 0
     ) -> NDArray[Any]:
         """As `read`, but in mirrors of what these show: the input of denoisers. See `visible_channel`."""
-        meshes = self.map("object_to_world").shape[1]
+        meshes = self.map("object_to_world").shape[1] if channel == "mesh_id" else 0
         return visible_channel(channel, self.layers, lambda name: self.read(name, frame, window, realisation), meshes)
 
     def read_blended(self, channel: str, frame: int) -> NDArray[Any]:
