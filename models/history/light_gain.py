@@ -54,9 +54,10 @@ def gain_of(
 ) -> Tensor:
     """What light is multiplied by in each tile, (B, 1, h, w), from `tile_sums`: of light, its change, and its variance.
 
-    The change of a neighbourhood is shrunk by the square of its noise, as James and Stein shrink means (1961): what is
-    below so many standard errors does not count. The squared standard error of a sum with weights w is Σ w² v for
-    values of variance v, and for a Gaussian w half of Σ w v; here v is the square of the change itself.
+    From `least` to MAX_GAIN. The change of a neighbourhood is shrunk by the square of its noise, as James and Stein
+    shrink means (1961): what is below so many standard errors does not count. The squared standard error of a sum
+    with weights w is Σ w² v for values of variance v, and for a Gaussian w half of Σ w v; here v is the square of the
+    change itself.
     """
     past, change, variance = gaussian_sums(sums, deviation).split(1, dim=1)
     size = change.abs().clamp(min=MIN_DIVISOR)

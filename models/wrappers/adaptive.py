@@ -29,7 +29,7 @@ from models.filters.baselines import AccumulatedState, Accumulating
 from models.filters.svgf import geometry_weight, pack_geometry
 from models.history.accumulation import Accumulation
 from models.history.geometry import GBuffer
-from models.history.light_gain import MAX_GAIN
+from models.history.light_gain import MAX_GAIN, MIN_GAIN
 from models.history.reprojection import reproject
 from models.operators import MAX_IRRADIANCE, MAX_LUMINANCE, MIN_DIVISOR, image_luminance
 from models.wrappers.wrapper import Wrapper
@@ -101,7 +101,7 @@ def history_gain(newest: Tensor, past: Tensor, clamped: Tensor, limit: Tensor, n
     """
     changed = significance(torch.minimum(newest, limit) - clamped, near)
     now, then, then_clamped = (near.sums(torch.cat([newest, past, clamped], dim=1)) + MIN_DIVISOR).split(1, dim=1)
-    unclamped = (now / then).clamp(1 / MAX_GAIN, MAX_GAIN)
+    unclamped = (now / then).clamp(MIN_GAIN, MAX_GAIN)
     gain = torch.ones_like(past)
     for _ in range(GAIN_ITERATIONS):
         ratio = (near.sums(torch.minimum(newest, limit * gain)) + MIN_DIVISOR) / then_clamped

@@ -73,6 +73,13 @@ def before_the_box(x: float = 0.0, turn: float = 0.0) -> np.ndarray:
     return pose
 
 
+def staged(name: str) -> tuple:
+    """A scene of ours as a Stage, and Mitsuba's sensor for its first view."""
+    stage = Stage(build_scene(name, 0, 4), HEIGHT, WIDTH)
+    view = stage.view(0)
+    return stage, sensor_at(view.camera_to_world, np.degrees(2 * np.arctan(WIDTH / 2 / abs(view.K[0, 0]))))
+
+
 def channels(scene, sensor, integrator: dict, seed: int = 0, spp: int = 1) -> dict[str, np.ndarray]:
     """The image, as `light`, and all guides, (H, W, C)."""
     image = np.array(mi.load_dict(integrator).render(scene, sensor, seed, spp))
@@ -86,10 +93,8 @@ def channels(scene, sensor, integrator: dict, seed: int = 0, spp: int = 1) -> di
 )
 def test_guides_are_those_of_our_renderer(package, name):
     """In first hits and behind mirrors and glass."""
-    stage = Stage(build_scene(name, 0, 4), HEIGHT, WIDTH)
-    view = stage.view(0)
-    sensor = sensor_at(view.camera_to_world, np.degrees(2 * np.arctan(WIDTH / 2 / abs(view.K[0, 0]))))
-    expected = render_gbuffer(stage, view)
+    stage, sensor = staged(name)
+    expected = render_gbuffer(stage, stage.view(0))
     for looks_through in (False, True):
         found = channels(stage.mitsuba_scene, sensor, GUIDES_ALONE | {"look_through": looks_through})
         for ours in ("albedo", "normal", "depth", "roughness"):
@@ -158,14 +163,11 @@ def test_what_does_not_move_has_no_flow(package):
 
 
 def test_shapes_in_mirrors_have_numbers_and_poses_of_their_own(package):
-    scene = build_scene("extremes-mirrors", 0, 4)
-    stage = Stage(scene, HEIGHT, WIDTH)
-    view = stage.view(0)
-    sensor = sensor_at(view.camera_to_world, np.degrees(2 * np.arctan(WIDTH / 2 / abs(view.K[0, 0]))))
+    stage, sensor = staged("extremes-mirrors")
     first = channels(stage.mitsuba_scene, sensor, GUIDES_ALONE)
     found = channels(stage.mitsuba_scene, sensor, GUIDES_ALONE | {"look_through": True})
     is_first = first["depth"] == found["depth"]
-    poses = np.random.default_rng(0).normal(size=(len(scene.shapes), 4, 4))
+    poses = np.random.default_rng(0).normal(size=stage.view(0).object_to_world.shape)
     shapes, visible_poses = package.denoiser.visible_shapes(found, poses)
     assert (shapes == found["shape"])[is_first].all() and (shapes > len(poses))[~is_first].mean() > 0.9
     hit = shapes > 0
