@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models.compiled.affinity import MIN_LOGIT
+from models.compiled.affinity import MESH_DISTANCE, MIN_LOGIT
 from models.compiled.light_gain import TILE
 from models.compiled.one import SIDE_MULTIPLE
 from models.export.history import in_whole_blocks, updated_scale
@@ -70,6 +70,7 @@ def affinity_level(
     centre: Tensor,
     importance: Tensor,
     surface: Tensor,
+    mesh: Tensor,
     step: int,
     guide: Tensor | None = None,
 ) -> Tensor:
@@ -81,8 +82,9 @@ def affinity_level(
         bright, strength = guide.split(1, dim=1)
         change = neighbour_taps(bright, step) - bright
         distance = distance + strength * change * change
-    taps = neighbour_taps(torch.cat([importance, values], dim=1), step)
-    importances, neighbours = taps[:, :1], taps[:, 1:]
+    taps = neighbour_taps(torch.cat([importance, mesh, values], dim=1), step)
+    importances, meshes, neighbours = taps[:, :1], taps[:, 1:2], taps[:, 2:]
+    distance = torch.where(meshes == mesh, distance, distance + MESH_DISTANCE)
     weight = torch.exp((importances - sharpness * distance).clamp(min=MIN_LOGIT))
     total = (weight * neighbours).sum(dim=0, keepdim=True) + torch.exp(centre) * values
     return torch.where(surface > 0, total[:, :-1] / total[:, -1:].clamp(min=MIN_DIVISOR), 0)
@@ -181,7 +183,7 @@ class OneStep(Step):
         whole = (SIDE_MULTIPLE * ((side + SIDE_MULTIPLE - 1) // SIDE_MULTIPLE) for side in size)
         head = resized(self.trunk(resized(channels, *whole)), *size) + self.trunk.detail(channels)
         decoded = Decoded(*decode(head, inputs, x["samples"]))
-        images = carried(decoded, history, surface, exposure, affinity_level)
+        images = carried(decoded, history, surface, mesh, exposure, affinity_level)
         coarse = correction_of(
             compared_sums(noisy, images[0], exposure, surface, x["motion"]),
             x["residual"],

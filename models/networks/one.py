@@ -13,7 +13,7 @@ from models import compiled
 from models.compiled import affinity as affinity_kernels
 from models.compiled import one as kernels
 from models.compiled import one_in_c
-from models.compiled.affinity import MIN_LOGIT
+from models.compiled.affinity import MESH_DISTANCE, MIN_LOGIT
 from models.compiled.one import (
     DARKEST,
     FILTER_PASSES,
@@ -161,19 +161,21 @@ def plain_level(
     own: Tensor,
     importance: Tensor,
     surface: Tensor,
+    mesh_id: Tensor,
     step: int,
     guide: Tensor | None = None,
 ) -> Tensor:
     """See affinity_level: the way that PyTorch takes."""
     count = features.shape[1]
-    taps = taps_3x3(torch.cat([features, importance, surface, image], dim=1), step)
+    taps = taps_3x3(torch.cat([features, importance, surface, mesh_id, image], dim=1), step)
     distance = (taps[:, :count] - features[:, :, None]).square().sum(dim=1)
+    distance = torch.where(taps[:, count + 2] == mesh_id, distance, distance + MESH_DISTANCE)
     if guide is not None:
         values, strength = guide.split(1, dim=1)
         distance = distance + strength * (taps_3x3(values, step)[:, 0] - values).square()
     exponent = (taps[:, count] - sharpness * distance).clamp(min=MIN_LOGIT)
     weight = torch.exp(torch.cat([exponent[:, :4], own, exponent[:, 5:]], dim=1)) * taps[:, count + 1]
-    total = (taps[:, count + 2 :] * weight[:, None]).sum(dim=2)
+    total = (taps[:, count + 3 :] * weight[:, None]).sum(dim=2)
     return torch.where(surface > 0, total / weight.sum(dim=1, keepdim=True).clamp(min=MIN_DIVISOR), 0)
 
 
@@ -183,16 +185,17 @@ class AffinityLevel(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         """The arguments are those of affinity_level, but the guide comes before the surface."""
-        *given, surface, step = arguments
-        out, total = affinity_kernels.filter_level(given, surface, step)
+        *given, surface, mesh_id, step = arguments
+        out, total = affinity_kernels.filter_level(given, surface, mesh_id, step)
         ctx.step = step
-        ctx.save_for_backward(*given, surface, out, total)
+        ctx.save_for_backward(*given, surface, mesh_id, out, total)
         return out
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        *given, surface, out, total = ctx.saved_tensors
-        return *affinity_kernels.pull_level(gradients[0], given, surface, out, total, ctx.step), None, None
+        *given, surface, mesh_id, out, total = ctx.saved_tensors
+        pulled = affinity_kernels.pull_level(gradients[0], given, surface, mesh_id, out, total, ctx.step)
+        return *pulled, None, None, None
 
 
 def affinity_level(
@@ -202,6 +205,7 @@ def affinity_level(
     own: Tensor,
     importance: Tensor,
     surface: Tensor,
+    mesh_id: Tensor,
     step: int,
     guide: Tensor | None = None,
 ) -> Tensor:
@@ -209,14 +213,16 @@ def affinity_level(
 
     The weight of tap q for pixel p is exp(importance_q - sharpness_p |f_p - f_q|²), that of p itself exp(own_p): Isik
     et al. 2021, Eq. 4, with two weights more. Only pixels that show a surface count; the others become 0.
-    image (B, C, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
-    (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows. A guide (B, 2, H, W), values g
+    Taps of another mesh are farther away: MESH_DISTANCE is added to the squared distance.
+    image (B, C, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance, surface (1 or 0) and
+    mesh_id (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows. A guide (B, 2, H, W), values g
     and their strength k, adds k_p (g_p - g_q)² to the squared distance; strength gets no gradients.
     """
     maps = features, sharpness, own, importance
     if not compiled.usable(image):
-        return plain_level(image, *maps, surface, step, guide)
-    return cast(Tensor, AffinityLevel.apply(image, *maps, features[:, :0] if guide is None else guide, surface, step))
+        return plain_level(image, *maps, surface, mesh_id, step, guide)
+    given = image, *maps, features[:, :0] if guide is None else guide
+    return cast(Tensor, AffinityLevel.apply(*given, surface, mesh_id, step))
 
 
 def luminance_guide(light: Tensor, length: Tensor, exposure: Tensor) -> Tensor:
@@ -232,6 +238,7 @@ def carried(
     decoded: Decoded,
     past: Tensor,
     surface: Tensor,
+    mesh_id: Tensor,
     exposure: Tensor,
     level: Callable[..., Tensor] = affinity_level,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -246,7 +253,7 @@ def carried(
     maps = [*zip(*planes, strict=True)]
 
     def filtered(image: Tensor, index: int, step: int, *guide: Tensor) -> Tensor:
-        return level(image, decoded.features, *maps[index], surface, step, *guide)
+        return level(image, decoded.features, *maps[index], surface, mesh_id, step, *guide)
 
     light = torch.cat([decoded.accumulated, surface], dim=1)
     outliers = decoded.outliers * light
@@ -364,7 +371,7 @@ class One(Denoiser):
         noisy = frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
         decoded, past, scale = self.decoded(frame, before, noisy, surface)
         exposure = scale.exposure() * frame.gain
-        output, accumulated, length, latent = carried(decoded, past, surface, exposure)
+        output, accumulated, length, latent = carried(decoded, past, surface, frame.mesh_id, exposure)
         images = output[:, :3], accumulated[:, :3], length, latent
         parts = output[:, 3:], accumulated[:, 3:]
         coarse = correct_coarsely(noisy, images[0], exposure, surface, frame.motion, before.coarse if before else None)

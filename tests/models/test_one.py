@@ -41,8 +41,10 @@ def noise(count: int, scale: float = 1.0) -> list[Tensor]:
     return [scale * torch.rand(1, 3, *SIZE, generator=generator) for _ in range(count)]
 
 
-def frames(images: list[Tensor], motion: tuple[float, float] = (0.0, 0.0)) -> list[Frame]:
-    return chain([flat_frame(*SIZE, motion, irradiance=image) for image in images])
+def frames(
+    images: list[Tensor], motion: tuple[float, float] = (0.0, 0.0), mesh_id: Tensor | None = None
+) -> list[Frame]:
+    return chain([flat_frame(*SIZE, motion, mesh_id=mesh_id, irradiance=image) for image in images])
 
 
 def test_frames_count_by_their_samples():
@@ -130,12 +132,16 @@ def square(side: int) -> Tensor:
     return image
 
 
+TWO_MESHES = torch.where(torch.arange(SIZE[1]) < 30, 1, 2).expand(1, 1, *SIZE)  # the square's, and one to its right
+
+
 def level(image: Tensor, step: int, guide: Tensor | None = None, strength: float = 0.0) -> Tensor:
-    """Where the network says nothing, taps have even weights but for their guide, with a sharpness of softplus(0)."""
+    """Where the network says nothing, weights are even but for mesh and guide, with a sharpness of softplus(0)."""
     values = torch.zeros_like(image[:, :1]) if guide is None else guide
-    there = taps(torch.cat([values, torch.ones_like(values), image], dim=1), 3, step)
-    weights = 2.0 ** (-strength * (there[:, :1] - values[:, :, None]).square()) * there[:, 1:2]
-    return (there[:, 2:] * weights).sum(dim=2) / weights.sum(dim=2)
+    there = taps(torch.cat([values, TWO_MESHES, torch.ones_like(values), image], dim=1), 3, step)
+    distance = strength * (there[:, :1] - values[:, :, None]).square() + 2 * (there[:, 1:2] != TWO_MESHES[:, :, None])
+    weights = 2.0**-distance * there[:, 2:3]
+    return (there[:, 3:] * weights).sum(dim=2) / weights.sum(dim=2)
 
 
 def filtered(light: Tensor, exposure: Tensor) -> Tensor:
@@ -150,7 +156,7 @@ def filtered(light: Tensor, exposure: Tensor) -> Tensor:
 @pytest.mark.usefixtures("implementation")
 def test_levels_follow_one_another_and_luminance_guides_the_last():
     image = 11 + 81 * square(5)  # no pixel is an outlier
-    _, state = play(silent(), frames([image]))
+    _, state = play(silent(), frames([image], mesh_id=TWO_MESHES))
     light = torch.cat([image[:, :1], torch.ones(1, 1, *SIZE)], dim=1)
     expected = filtered(light, state.scale.exposure())
     torch.testing.assert_close(state.output, expected.expand(1, 3, -1, -1))
@@ -159,7 +165,7 @@ def test_levels_follow_one_another_and_luminance_guides_the_last():
 @pytest.mark.usefixtures("implementation")
 def test_outliers_are_spread():
     """What is beyond eight times the mean of 9 x 9 pixels passes through two levels more, with its weight."""
-    outputs, state = play(silent(), frames([1 + 162 * square(1)]))
+    outputs, state = play(silent(), frames([1 + 162 * square(1)], mesh_id=TWO_MESHES))
     centre = square(1)[:, :1]
     share = 139 / 163 * centre
     light = torch.cat([1 + 162 * centre, torch.ones_like(centre)], dim=1)
