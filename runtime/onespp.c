@@ -104,6 +104,7 @@ enum {
 #define MIN_MASS 1e-30f
 #define MIN_LENGTH 1e-3f /* samples of a history, to divide by */
 #define OUTLIER 8.f /* times the mean over 9 x 9 pixels: what is brighter is spread */
+#define MESH_DISTANCE 2.f /* squared, of meshes beside that of features, which are alike where meshes look alike */
 #define GUIDANCE 30.f /* weight of squared differences of the guide beside those of features, for each sample */
 #define DARKEST 0.01f /* exposed luminance: what is darker looks alike to guided levels */
 #define GAIN_NOISE 3.f /* standard errors: smaller changes of light do not count */
@@ -701,6 +702,12 @@ static void load_part(float *restrict line, const onespp_frame *frame, int part,
     }
 }
 
+/* Where a row's mesh ids begin in a history. */
+static int32_t *mesh_line(const onespp *d, const History *history, int y)
+{
+    return history->mesh + (ptrdiff_t)y * d->pitch + MARGIN;
+}
+
 /* Where a row's line begins. */
 static float *row_line(const onespp *d, int y, int line)
 {
@@ -974,7 +981,9 @@ static inline int is_consistent(const Job *job, const Surface *surface, int x, i
 {
     const History *past = &job->d->past;
     ptrdiff_t pixel = (ptrdiff_t)y * job->d->pitch + x;
-    if (x < 0 || y < 0 || x >= past->moment->width || y >= past->moment->height || past->mesh[pixel] != surface->mesh)
+    if (x < 0 || y < 0 || x >= past->moment->width || y >= past->moment->height)
+        return 0;
+    if (mesh_line(job->d, past, y)[x] != surface->mesh)
         return 0;
     if (surface->mesh == BACKGROUND)
         return 1;
@@ -1772,6 +1781,9 @@ static void exclude_margins(const Job *job, int y)
     for (int c = 0; c < 3 * LEVELS; c++)
         fill_margins(job, row_line(job->d, y, LEVEL_LINES + c), c % 3 == 2 ? NO_WEIGHT : 0);
     fill_margins(job, row_line(job->d, y, GUIDE_LINE), 0);
+    int32_t *mesh = mesh_line(job->d, &job->d->next, y);
+    for (int i = 1; i <= MARGIN; i++)
+        mesh[-i] = mesh[job->frame.width - 1 + i] = BACKGROUND;
 }
 
 /* Decodes a chunk of a row. */
@@ -1779,6 +1791,7 @@ static void decode(const Job *job, Scratch *scratch, int y, int x0, int n)
 {
     float(*head)[LINE] = scratch->leave.head;
     load(scratch->leave.depth, &job->frame.depth, 0, y, x0, n);
+    load_mesh(mesh_line(job->d, &job->d->next, y) + x0, &job->frame, y, x0, n); /* the past ones were read */
     for (int c = 0; c < RGB; c++)
         memcpy(scratch->leave.noisy[c], row_line(job->d, y, NOISY_LINES + c) + x0, sizeof(float) * (size_t)n);
     for (int c = 0; c < FEATURES; c++)
@@ -1923,6 +1936,18 @@ static void add_squares(
     }
 }
 
+/* The same of meshes. */
+static void add_meshes(
+    float (*restrict distances)[LINE], const int32_t *restrict here, const int32_t *restrict there, int step, int n)
+{
+    float *restrict left = distances[0], *restrict middle = distances[1], *restrict right = distances[2];
+    for (int i = 0; i < n; i++) {
+        left[i] += here[i] == there[i - step] ? 0.f : MESH_DISTANCE;
+        middle[i] += here[i] == there[i] ? 0.f : MESH_DISTANCE;
+        right[i] += here[i] == there[i + step] ? 0.f : MESH_DISTANCE;
+    }
+}
+
 /* The same of the guide: the more samples a pixel has, the less noise there is in it. */
 static void add_guide(
     float (*restrict distances)[LINE], const float *restrict here, const float *restrict there,
@@ -1960,6 +1985,7 @@ static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *r
     const float *features = row_line(d, y, FEATURE_LINES) + x0, *guide = row_line(d, y, GUIDE_LINE) + x0;
     const float *sharpness = row_line(d, y, line) + x0, *centre = sharpness + d->pitch, *importance = centre + d->pitch;
     const float *samples = row_line(d, y, LENGTH_LINE) + x0;
+    const int32_t *mesh = mesh_line(d, &d->next, y) + x0;
     memset(weights, 0, sizeof *weights * TAPS); /* of rows outside the image, for good */
     for (int i = 0; i < n; i++) /* the pixel's own, to which its distance, 0, is added */
         scale[i] = weights[TAPS / 2][i] = exponential(centre[i]);
@@ -1970,6 +1996,7 @@ static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *r
         const float *there = row_line(d, row, FEATURE_LINES) + x0;
         for (int f = 0; f < FEATURES; f += TOGETHER)
             add_squares(weights + tap, features + f * d->pitch, there + f * d->pitch, d->pitch, step, n);
+        add_meshes(weights + tap, mesh, mesh_line(d, &d->next, row) + x0, step, n);
         if (job->pass >= FIRST_GUIDED)
             add_guide(weights + tap, guide, row_line(d, row, GUIDE_LINE) + x0, samples, step, n);
         for (int i = 0; i < 3; i++)
@@ -2098,7 +2125,6 @@ static void remember(const Job *job, int y, int x0, int n)
             d->next.part_texels[(pixel + i) * of_parts + c] = line[i];
     }
     load(d->next.depth + pixel, &job->frame.depth, 0, y, x0, n);
-    load_mesh(d->next.mesh + pixel, &job->frame, y, x0, n);
 }
 
 /* A colour of a part of the light, blended. */

@@ -278,6 +278,21 @@ def test_meshes_without_a_pose_stand_still(limited, one):
         assert output.isfinite().all()
 
 
+@pytest.mark.parametrize("size", [SIZE, (70, 300)])
+def test_meshes_that_look_alike_are_told_apart(limited, one, size):
+    """By their numbers alone, also where float32 could not tell these apart."""
+    generator = torch.Generator().manual_seed(2)
+    light = [torch.rand(1, 3, *size, generator=generator) ** 4 for _ in range(3)]
+    rows, columns = (torch.arange(side) // 5 for side in size)
+    ids = (1 + (rows[:, None] + columns) % 2)[None, None]  # a chessboard
+    sequence = chain([flat_frame(*size, mesh_id=ids, irradiance=each) for each in light])
+    compare(limited, one, sequence)
+    small, large = (CRuntime(limited, size[1], size[0]) for _ in range(2))
+    for index, frame in enumerate(sequence):
+        renamed = frame.with_channels({"mesh_id": 2.0**30 + frame.mesh_id.double()})
+        assert torch.equal(large(renamed, index == 0), small(frame, index == 0))
+
+
 def test_optional_images(limited, one, frames):
     """Their values by default, and one mesh for all surfaces."""
     ones, zeros = torch.ones_like(frames[0].depth), torch.zeros_like(frames[0].direct)
