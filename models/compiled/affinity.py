@@ -23,7 +23,7 @@ from models.compiled.jit import array, jit_in_any_order, jit_inlined, jit_parall
 from models.compiled.lines import add_line, add_product, normalise, scale_line
 
 # Squared distance of two meshes, beside that of their features: the network learns to compare features, and gives like
-# ones to meshes of like colour, depth and normal. Untrained, scenes of strangers gain 0.1 to 0.15 dB by it.
+# ones to meshes of like colour, depth and normal (train/campaign/README.md).
 MESH_DISTANCE = 2.0
 MIN_LOGIT = -40.0  # smallest logit of a tap's weight: smaller ones are clamped
 AFFINITY_BLOCK_PIXELS = 2048  # filtered together, in whole rows: what they need stays in the first caches
