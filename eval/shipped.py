@@ -134,7 +134,7 @@ def training(name: str, recipe: dict[str, Any]) -> str:
     return f"""\
 - Trained by {command}
   on {dataset(recipe["data"])}{start}.
-  Weights of step {recipe["step"]}, which had the lowest validation loss: {recipe["validation"]:.4g}.
+  Weights of step {recipe["step"]}, with a validation loss of {recipe["validation"]:.4g}.
 - Recipe: `{json.dumps(rest)}`."""
 
 

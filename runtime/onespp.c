@@ -104,7 +104,7 @@ enum {
 #define MIN_MASS 1e-30f
 #define MIN_LENGTH 1e-3f /* samples of a history, to divide by */
 #define OUTLIER 8.f /* times the mean over 9 x 9 pixels: what is brighter is spread */
-#define MESH_DISTANCE 2.f /* squared, of meshes beside that of features, which are alike where meshes look alike */
+#define MESH_DISTANCE 2.f /* added to the squared distance of features between meshes, which may look alike */
 #define GUIDANCE 30.f /* weight of squared differences of the guide beside those of features, for each sample */
 #define DARKEST 0.01f /* exposed luminance: what is darker looks alike to guided levels */
 #define GAIN_NOISE 3.f /* standard errors: smaller changes of light do not count */

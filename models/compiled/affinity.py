@@ -22,8 +22,8 @@ from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_inlined, jit_parallel, jit_with_memory, match_threads
 from models.compiled.lines import add_line, add_product, normalise, scale_line
 
-# Squared distance of two meshes, beside that of their features: the network learns to compare features, and gives like
-# ones to meshes of like colour, depth and normal (train/campaign/README.md).
+# Added to the squared distance of features where meshes differ: the network gives like features to meshes of like
+# colour, depth and normal (train/campaign/README.md).
 MESH_DISTANCE = 2.0
 MIN_LOGIT = -40.0  # smallest logit of a tap's weight: smaller ones are clamped
 AFFINITY_BLOCK_PIXELS = 2048  # filtered together, in whole rows: what they need stays in the first caches

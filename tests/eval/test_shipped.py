@@ -85,7 +85,7 @@ def test_only_the_generated_part_of_a_card_changes(wskp3, tiny, tmp_path, capsys
         file_digest(wskp3),
         "`onespp train wskp3 --budget tiny --seed 3` on the data set `my.toml` (seed 4, ",
         "generator version 5, 2 scenes). Weights",
-        "of step 78, which had the lowest validation loss: 0.1235",
+        "of step 78, with a validation loss of 0.1235",
         '`{"loss": {"epsilon": 0.01}, "epochs": 6}`',
         "torch 1.2.3, code c0de and torch 1.2.4, code c0d3",
         "2 test clips at 1 spp of `tiny`, total radiance",
