@@ -19,9 +19,15 @@ from scenes.camera import View
 
 MAX_MIRRORS = 4  # along a ray
 LONGEST_CHAIN = 12  # in scenes with glass
-# Of what a surface reflects, in pixels: where it is blurred more, its own guides serve denoisers better.
-MAX_BLUR = 0.75
+# Where what a surface reflects is blurred more, its own guides serve denoisers better (docs/experiments.md).
+MAX_BLUR = 0.75  # px, in images of up to 180 rows
+MAX_BLUR_OF_HEIGHT = MAX_BLUR / 180  # in larger ones: the same picture has more pixels between its edges
 ALMOST_ONE = 1 - 2.0**-24  # as a random number: it chooses transmission wherever there is any
+
+
+def max_blur(height: int) -> float:
+    """The largest blur of what a mirror shows in images of `height` rows, in pixels: half of the light is within it."""
+    return max(MAX_BLUR, MAX_BLUR_OF_HEIGHT * height)
 
 
 @dataclass
@@ -82,11 +88,11 @@ def flipped(axis: mi.Vector3f, normal: mi.Vector3f) -> mi.Vector3f:
 
 
 def one_further(
-    stage: Stage, sight: Sight, eye_distance: mi.Float, focal: mi.Float, rarer_first: mi.Bool, may_split: mi.Bool
+    stage: Stage, sight: Sight, eye_distance: mi.Float, max_angle: mi.Float, rarer_first: mi.Bool, may_split: mi.Bool
 ) -> Sight:
     """What the last surfaces show; unchanged where they show nothing, a ray misses or the picture is blurred.
 
-    `eye_distance` is the length of primary rays, `focal` the focal length in pixels.
+    `eye_distance` is the length of primary rays, `max_angle` the largest blur in radians, as seen from the eye.
     """
     here: Any = sight.si
     is_mirror, tint, alpha = stage.materials.mirror_at(here)
@@ -116,7 +122,7 @@ def one_further(
     beyond = sight.beyond + step / index
     spread = sight.spread + 2 * alpha
     blur = sight.blur + spread * step
-    is_sharp = blur * focal < MAX_BLUR * (eye_distance + beyond)
+    is_sharp = blur < max_angle * (eye_distance + beyond)
     goes_on = sight.goes_on & shows & there.is_valid() & is_sharp
     x, y, z = axes
     shown = Sight(
@@ -151,13 +157,13 @@ class Shown:
     reflectance: mi.Float  # as in Sight
 
 
-def shown(stage: Stage, ray: mi.Ray3f, focal: mi.Float, rarer_first: mi.Bool, max_splits: mi.UInt32) -> Shown:
+def shown(stage: Stage, ray: mi.Ray3f, max_angle: mi.Float, rarer_first: mi.Bool, max_splits: mi.UInt32) -> Shown:
     """As `look_through`: the loop over events runs in the kernel."""
     si: Any = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     longest = MAX_MIRRORS if stage.glass is None else LONGEST_CHAIN
 
     def step(number: mi.UInt32, sight: Sight) -> tuple[mi.UInt32, Sight]:
-        return number + 1, one_further(stage, sight, si.t, focal, rarer_first, number < max_splits)
+        return number + 1, one_further(stage, sight, si.t, max_angle, rarer_first, number < max_splits)
 
     start = mi.UInt32(0), Sight.along(ray, si)
     sight = dr.while_loop(start, lambda number, sight: (number < longest) & sight.goes_on, step)[1]
@@ -172,5 +178,5 @@ def look_through(stage: Stage, view: View, ray: mi.Ray3f, rarer_first: bool = Fa
     Rays split at the first glass, if it is among the first `max_splits` events. rarer_first: follow the rarer branch
     there.
     """
-    focal = upload(np.abs(view.K[:1, 0]))
-    return stage.replay(shown, ray, focal, dr.opaque(mi.Bool, rarer_first), dr.opaque(mi.UInt32, max_splits))
+    max_angle = upload(max_blur(stage.height) / np.abs(view.K[:1, 0]))
+    return stage.replay(shown, ray, max_angle, dr.opaque(mi.Bool, rarer_first), dr.opaque(mi.UInt32, max_splits))
