@@ -83,7 +83,8 @@ def test_off_screen_and_disoccluded_pixels_have_no_history():
 
 def test_tone_mapping_is_inverted():
     rgb = torch.rand(1, 3, 5, 5) * 10 ** torch.linspace(-6, 10, 25).view(5, 5)
-    torch.testing.assert_close(inverse_tone_map(tone_map(rgb)), rgb, rtol=1e-4, atol=0)
+    error = (inverse_tone_map(tone_map(rgb)) - rgb).abs()
+    assert (error <= 4 * torch.finfo().eps * rgb.amax(dim=1, keepdim=True)).all()  # channels are differences of others
     grey = tone_map(torch.full((1, 3, 1, 1), 3.0))
     torch.testing.assert_close(grey[0, :, 0, 0], torch.tensor([0.75, 0.0, 0.0, 0.25]))
 
