@@ -86,7 +86,7 @@ enum {
     MARGIN = 64, /* floats before and after other lines: the largest distance of taps of the filter */
     LINE = PITCH(CHUNK),
     HALF_LINE = PITCH(HALF_CHUNK), /* has room for the pixels beside the chunk, too */
-    ALIGNMENT = 64, /* bytes, a line of caches */
+    ALIGNMENT = 64, /* bytes: a cache line */
     BACKGROUND = 0 /* mesh id of pixels that show no surface */
 };
 
@@ -1329,7 +1329,7 @@ static inline void end(float *restrict outputs, const float *restrict sums, floa
         outputs[i] = maxf(sums[i], least);
 }
 
-/* Asks for n floats that will soon be needed, where processors do not foresee it. */
+/* Prefetches n floats: hardware prefetchers do not follow the jumps from line to line. */
 static inline void prefetch(const float *line, int n)
 {
     for (int i = 0; i < n; i += ALIGNMENT / (int)sizeof(float))
