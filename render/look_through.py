@@ -19,15 +19,11 @@ from scenes.camera import View
 
 MAX_MIRRORS = 4  # along a ray
 LONGEST_CHAIN = 12  # in scenes with glass
-# Where what a surface reflects is blurred more, its own guides serve denoisers better (docs/experiments.md).
-MAX_BLUR = 0.75  # px, in images of up to 180 rows
-MAX_BLUR_OF_HEIGHT = MAX_BLUR / 180  # in larger ones: the same picture has more pixels between its edges
+# Where what a surface reflects is blurred more, its own guides serve denoisers better (docs/experiments.md). In pixels,
+# for images of up to SMALL_HEIGHT rows; larger ones have more pixels between the edges of the same picture.
+MAX_BLUR = 0.75
+SMALL_HEIGHT = 180
 ALMOST_ONE = 1 - 2.0**-24  # as a random number: it chooses transmission wherever there is any
-
-
-def max_blur(height: int) -> float:
-    """The largest blur of what a mirror shows in images of `height` rows, in pixels: half of the light is within it."""
-    return max(MAX_BLUR, MAX_BLUR_OF_HEIGHT * height)
 
 
 @dataclass
@@ -178,5 +174,6 @@ def look_through(stage: Stage, view: View, ray: mi.Ray3f, rarer_first: bool = Fa
     Rays split at the first glass, if it is among the first `max_splits` events. rarer_first: follow the rarer branch
     there.
     """
-    max_angle = upload(max_blur(stage.height) / np.abs(view.K[:1, 0]))
+    max_blur = MAX_BLUR * max(1, stage.height / SMALL_HEIGHT)
+    max_angle = upload(max_blur / np.abs(view.K[:1, 0]))
     return stage.replay(shown, ray, max_angle, dr.opaque(mi.Bool, rarer_first), dr.opaque(mi.UInt32, max_splits))
