@@ -54,7 +54,6 @@ enum {
     RGB = 3,
     LATENT = 6,   /* channels carried from frame to frame */
     FEATURES = 8, /* that pixels are compared by */
-    TOGETHER = 4, /* features: so many lines are compared at a time */
     LEVELS = 6,   /* of the filter */
     SPREADING = 2, /* the first passes, which spread outliers before all levels filter */
     FIRST_GUIDED = SPREADING + LEVELS, /* pass: from it on they are guided by luminance */
@@ -280,6 +279,9 @@ enum { MAX_PART_HISTORY = PART_HISTORY * ONESPP_MAX_PARTS };
 /* Channels that are filtered: the image's colours and the sum of its weights, then colours of parts of the light. */
 enum { MASS = RGB, FILTERED, MAX_FILTERED = FILTERED + RGB * ONESPP_MAX_PARTS };
 
+/* Taps that the filter measures distances to, in the order of taps. Distances to the others are measured from there. */
+enum { RIGHT, LEFT_BELOW, BELOW, RIGHT_BELOW, DIRECTIONS };
+
 /* Some rows of an image at the network's resolutions, surrounded by zeros. */
 typedef struct {
     float *data;
@@ -422,6 +424,7 @@ struct onespp {
     Comparison *comparisons; /* of tiles */
     Residual *residuals;
     float *depths;
+    float *distances; /* lines of each task, see distance_line */
     Scratch *scratch;
     float *parameters;
 };
@@ -535,6 +538,8 @@ static void lay_out(onespp *d, Arena *arena)
     d->comparisons = allocate(arena, tiles, sizeof(Comparison));
     d->residuals = allocate(arena, tiles, sizeof(Residual));
     d->depths = allocate(arena, MAX_DEPTHS, sizeof(float));
+    uint64_t lines = 2 * DIRECTIONS * (uint64_t)d->config.tasks;
+    d->distances = allocate(arena, lines * (uint64_t)d->pitch, sizeof(float));
     d->scratch = allocate(arena, (uint64_t)d->config.tasks, sizeof(Scratch));
     lay_out_layers(d, arena);
     lay_out_strip(d, arena);
@@ -1929,62 +1934,92 @@ static float *filtered_line(const onespp *d, int pass, int y, int channel)
 
 static int filtered_channels(const Job *job) { return FILTERED + RGB * job->frame.parts; }
 
-/* Adds the squared distances of TOGETHER features of n pixels, in lines `pitch` apart, from three taps in a row. */
-static void add_squares(
-    float (*restrict distances)[LINE], const float *restrict here, const float *restrict there, ptrdiff_t pitch,
-    int step, int n)
+/* A line of squared distances. A task has those of two rows, and uses them in turn: `turn` is 0 or 1. */
+static float *distance_line(const onespp *d, const Scratch *scratch, int turn, int direction)
 {
-    float *restrict left = distances[0], *restrict middle = distances[1], *restrict right = distances[2];
+    ptrdiff_t line = ((scratch - d->scratch) * 2 + turn) * DIRECTIONS + direction;
+    return d->distances + line * d->pitch + MARGIN;
+}
+
+/* The squared distances of the features, in lines `pitch` apart, of n pixels. */
+static void measure_features(
+    float *const *distances, const float *restrict here, const float *restrict below, ptrdiff_t pitch, int step, int n)
+{
+    float *restrict right = distances[RIGHT], *restrict left_below = distances[LEFT_BELOW];
+    float *restrict straight_below = distances[BELOW], *restrict right_below = distances[RIGHT_BELOW];
     for (int i = 0; i < n; i++) {
-        float a = left[i], b = middle[i], c = right[i];
-        for (int f = 0; f < TOGETHER; f++) {
-            const float *tap = there + f * pitch + i;
-            float value = here[f * pitch + i];
-            a += (value - tap[-step]) * (value - tap[-step]);
-            b += (value - tap[0]) * (value - tap[0]);
-            c += (value - tap[step]) * (value - tap[step]);
+        float to_right = 0, to_left_below = 0, to_below = 0, to_right_below = 0;
+        for (int f = 0; f < FEATURES; f++) {
+            const float *beside = here + f * pitch + i, *tap = below + f * pitch + i;
+            float value = beside[0];
+            to_right += (value - beside[step]) * (value - beside[step]);
+            to_left_below += (value - tap[-step]) * (value - tap[-step]);
+            to_below += (value - tap[0]) * (value - tap[0]);
+            to_right_below += (value - tap[step]) * (value - tap[step]);
         }
-        left[i] = a;
-        middle[i] = b;
-        right[i] = c;
+        right[i] = to_right;
+        left_below[i] = to_left_below;
+        straight_below[i] = to_below;
+        right_below[i] = to_right_below;
     }
 }
 
-/* The same of meshes. */
+/* Meshes that differ are farther away. */
 static void add_meshes(
-    float (*restrict distances)[LINE], const int32_t *restrict here, const int32_t *restrict there, int step, int n)
+    float *const *distances, const int32_t *restrict here, const int32_t *restrict below, int step, int n)
 {
-    float *restrict left = distances[0], *restrict middle = distances[1], *restrict right = distances[2];
+    float *restrict right = distances[RIGHT], *restrict left_below = distances[LEFT_BELOW];
+    float *restrict straight_below = distances[BELOW], *restrict right_below = distances[RIGHT_BELOW];
     for (int i = 0; i < n; i++) {
-        left[i] += here[i] == there[i - step] ? 0.f : MESH_DISTANCE;
-        middle[i] += here[i] == there[i] ? 0.f : MESH_DISTANCE;
-        right[i] += here[i] == there[i + step] ? 0.f : MESH_DISTANCE;
+        right[i] += here[i] == here[i + step] ? 0.f : MESH_DISTANCE;
+        left_below[i] += here[i] == below[i - step] ? 0.f : MESH_DISTANCE;
+        straight_below[i] += here[i] == below[i] ? 0.f : MESH_DISTANCE;
+        right_below[i] += here[i] == below[i + step] ? 0.f : MESH_DISTANCE;
     }
 }
 
-/* The same of the guide: the more samples a pixel has, the less noise there is in it. */
+/* Measures the squared distances of n pixels to the taps to the right and below: those to the other taps were measured
+ * there. In the last row, which has none below, only the distances to the right are used. */
+static void measure_pairs(const Job *job, const Scratch *scratch, int turn, int y, int x0, int n)
+{
+    const onespp *d = job->d;
+    int step = TAP_SPACINGS[job->pass], below = mini(y + step, job->frame.height - 1);
+    const float *features = row_line(d, y, FEATURE_LINES) + x0, *taps = row_line(d, below, FEATURE_LINES) + x0;
+    float *distances[DIRECTIONS];
+    for (int i = 0; i < DIRECTIONS; i++)
+        distances[i] = distance_line(d, scratch, turn, i) + x0;
+    measure_features(distances, features, taps, d->pitch, step, n);
+    add_meshes(distances, mesh_line(d, &d->next, y) + x0, mesh_line(d, &d->next, below) + x0, step, n);
+}
+
+/* The squared distances of n pixels from a tap. */
+static const float *distances_from(const Job *job, const Scratch *scratch, int turn, int tap, int x0)
+{
+    int step = TAP_SPACINGS[job->pass], column = tap % 3 - 1;
+    if (tap > TAPS / 2)
+        return distance_line(job->d, scratch, turn, tap - TAPS / 2 - 1) + x0;
+    /* The pixel is a tap of that one, in the opposite direction. */
+    int measured = tap < 3 ? !turn : turn;
+    return distance_line(job->d, scratch, measured, TAPS / 2 - 1 - tap) + x0 + column * step;
+}
+
+/* Squared distances with those of the guide: the more samples a pixel has, the less noise there is in it. */
 static void add_guide(
-    float (*restrict distances)[LINE], const float *restrict here, const float *restrict there,
-    const float *restrict samples, int step, int n)
+    float *restrict guided, const float *restrict distance, const float *restrict here, const float *restrict there,
+    const float *restrict samples, int n)
 {
-    float *restrict left = distances[0], *restrict middle = distances[1], *restrict right = distances[2];
-    for (int i = 0; i < n; i++) {
-        float strength = GUIDANCE * samples[i], value = here[i];
-        const float *tap = there + i;
-        left[i] += strength * (value - tap[-step]) * (value - tap[-step]);
-        middle[i] += strength * (value - tap[0]) * (value - tap[0]);
-        right[i] += strength * (value - tap[step]) * (value - tap[step]);
-    }
+    for (int i = 0; i < n; i++)
+        guided[i] = distance[i] + GUIDANCE * samples[i] * (here[i] - there[i]) * (here[i] - there[i]);
 }
 
-/* Weights of a tap of n pixels: exp(importance of the tap - sharpness of the pixel times their distance, which is what
- * `weight` is at first). They are added to `total`. */
+/* Weights of a tap of n pixels: exp(importance of the tap - sharpness of the pixel times their distance). They are added to
+ * `total`. */
 static void weigh_tap(
-    float *restrict weight, float *restrict total, const float *restrict sharpness, const float *restrict importance,
-    int n)
+    float *restrict weight, float *restrict total, const float *restrict distance, const float *restrict sharpness,
+    const float *restrict importance, int n)
 {
     for (int i = 0; i < n; i++) {
-        float exponent = maxf(importance[i] - sharpness[i] * weight[i], MIN_LOGIT);
+        float exponent = maxf(importance[i] - sharpness[i] * distance[i], MIN_LOGIT);
         weight[i] = importance[i] > NO_WEIGHT ? exponential(exponent) : 0;
         total[i] += weight[i];
     }
@@ -1992,30 +2027,31 @@ static void weigh_tap(
 
 /* Weights of 3 x 3 taps of n pixels: Isik et al. 2021, Eq. 4, with two weights more, of which `centre` is the pixel's own.
  * `scale` becomes 1 / their sum, or 0 off surfaces. */
-static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *restrict scale, int y, int x0, int n)
+static void weigh_taps(
+    const Job *job, const Scratch *scratch, int turn, float (*restrict weights)[LINE], float *restrict scale, int y,
+    int x0, int n)
 {
     const onespp *d = job->d;
     int step = TAP_SPACINGS[job->pass], line = LEVEL_LINES + 3 * PASS_LEVELS[job->pass];
-    const float *features = row_line(d, y, FEATURE_LINES) + x0, *guide = row_line(d, y, GUIDE_LINE) + x0;
     const float *sharpness = row_line(d, y, line) + x0, *centre = sharpness + d->pitch, *importance = centre + d->pitch;
-    const float *samples = row_line(d, y, LENGTH_LINE) + x0;
-    const int32_t *mesh = mesh_line(d, &d->next, y) + x0;
-    memset(weights, 0, sizeof *weights * TAPS); /* of rows outside the image, for good */
-    for (int i = 0; i < n; i++) /* the pixel's own, to which its distance, 0, is added */
+    const float *guide = row_line(d, y, GUIDE_LINE) + x0, *samples = row_line(d, y, LENGTH_LINE) + x0;
+    float guided[LINE];
+    for (int i = 0; i < n; i++)
         scale[i] = weights[TAPS / 2][i] = exponential(centre[i]);
-    for (int tap = 0; tap < TAPS; tap += 3) {
-        int row = y + (tap / 3 - 1) * step;
-        if (row < 0 || row >= job->frame.height)
+    for (int tap = 0; tap < TAPS; tap++) {
+        int row = y + (tap / 3 - 1) * step, x = x0 + (tap % 3 - 1) * step;
+        if (tap == TAPS / 2)
             continue;
-        const float *there = row_line(d, row, FEATURE_LINES) + x0;
-        for (int f = 0; f < FEATURES; f += TOGETHER)
-            add_squares(weights + tap, features + f * d->pitch, there + f * d->pitch, d->pitch, step, n);
-        add_meshes(weights + tap, mesh, mesh_line(d, &d->next, row) + x0, step, n);
-        if (job->pass >= FIRST_GUIDED)
-            add_guide(weights + tap, guide, row_line(d, row, GUIDE_LINE) + x0, samples, step, n);
-        for (int i = 0; i < 3; i++)
-            if (tap + i != TAPS / 2)
-                weigh_tap(weights[tap + i], scale, sharpness, row_line(d, row, line + 2) + x0 + (i - 1) * step, n);
+        if (row < 0 || row >= job->frame.height) {
+            memset(weights[tap], 0, sizeof(float) * (size_t)n);
+            continue;
+        }
+        const float *distance = distances_from(job, scratch, turn, tap, x0);
+        if (job->pass >= FIRST_GUIDED) {
+            add_guide(guided, distance, guide, row_line(d, row, GUIDE_LINE) + x, samples, n);
+            distance = guided;
+        }
+        weigh_tap(weights[tap], scale, distance, sharpness, row_line(d, row, line + 2) + x, n);
     }
     for (int i = 0; i < n; i++)
         scale[i] = importance[i] > NO_WEIGHT ? 1 / scale[i] : 0;
@@ -2039,11 +2075,12 @@ static void sum_weighted(
 }
 
 /* A pass of the filter at n pixels of a row: `to` has a line for each channel. */
-static void filter_chunk(const Job *job, float *const *to, int y, int x0, int n)
+static void filter_chunk(const Job *job, const Scratch *scratch, int turn, float *const *to, int y, int x0, int n)
 {
     int step = TAP_SPACINGS[job->pass];
     float weights[TAPS][LINE], scale[LINE];
-    weigh_taps(job, weights, scale, y, x0, n);
+    measure_pairs(job, scratch, turn, y, x0, n);
+    weigh_taps(job, scratch, turn, weights, scale, y, x0, n);
     for (int c = 0; c < filtered_channels(job); c++) {
         const float *rows[3];
         for (int i = 0; i < 3; i++) { /* rows outside the image have no weight */
@@ -2102,18 +2139,47 @@ static void guide_rows(Job *job, Scratch *scratch, int first, int last)
         }
 }
 
+/* The row that a pass filters as number `index`. Rows `step` apart follow each other, for they share taps: chains of
+ * height / step rows, and of one more in the first height % step of them. */
+static int row_in_order(int index, int step, int height)
+{
+    int rows = height / step, longer = height % step, of_longer = longer * (rows + 1);
+    if (index < of_longer)
+        return index / (rows + 1) + index % (rows + 1) * step;
+    index -= of_longer;
+    return longer + index / rows + index % rows * step;
+}
+
+/* Filters the rows `first` to `last` - 1 of that order; `leave` gets each chunk. */
+static void filter_in_order(
+    Job *job, Scratch *scratch, int first, int last,
+    void (*leave)(Job *job, const Scratch *scratch, int turn, int y, int x0, int n))
+{
+    int step = TAP_SPACINGS[job->pass], width = job->frame.width, turn = 0, before = -1;
+    for (int index = first; index < last; index++) {
+        int y = row_in_order(index, step, job->frame.height);
+        if (y >= step && before != y - step) /* else this was measured before, or there is no row above */
+            for (int x0 = 0; x0 < width; x0 += CHUNK)
+                measure_pairs(job, scratch, !turn, y - step, x0, mini(CHUNK, width - x0));
+        for (int x0 = 0; x0 < width; x0 += CHUNK)
+            leave(job, scratch, turn, y, x0, mini(CHUNK, width - x0));
+        before = y;
+        turn = !turn;
+    }
+}
+
+/* A chunk of what all passes but the last leave. */
+static void filter_to_lines(Job *job, const Scratch *scratch, int turn, int y, int x0, int n)
+{
+    float *to[MAX_FILTERED];
+    for (int c = 0; c < filtered_channels(job); c++)
+        to[c] = filtered_line(job->d, job->pass, y, c) + x0;
+    filter_chunk(job, scratch, turn, to, y, x0, n);
+}
+
 static void filter_rows(Job *job, Scratch *scratch, int first, int last)
 {
-    (void)scratch;
-    float *to[MAX_FILTERED];
-    int step = TAP_SPACINGS[job->pass];
-    for (int start = first; start < mini(first + step, last); start++)
-        for (int y = start; y < last; y += step) /* two of the three rows that it needs are in the cache */
-            for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
-                for (int c = 0; c < filtered_channels(job); c++)
-                    to[c] = filtered_line(job->d, job->pass, y, c) + x0;
-                filter_chunk(job, to, y, x0, mini(CHUNK, job->frame.width - x0));
-            }
+    filter_in_order(job, scratch, first, last, filter_to_lines);
 }
 
 /* --- The end of a frame ------------------------------------------------------------------------------------------- */
@@ -2151,36 +2217,36 @@ static void finish_part(const Job *job, int part, int channel, const float *rest
         output[i] = importance[i] > NO_WEIGHT ? output[i] + alpha[i] * (filtered[i] - output[i]) : 0;
 }
 
-/* The last level: its output, divided by the mass, is blended into that of the previous frame. */
-static void finish_rows(Job *job, Scratch *scratch, int first, int last)
+/* A chunk of the last level: its output, divided by the mass, is blended into that of the previous frame. */
+static void finish_chunk(Job *job, const Scratch *scratch, int turn, int y, int x0, int n)
 {
-    (void)scratch;
     const onespp *d = job->d;
     float filtered[MAX_FILTERED][LINE], *to[MAX_FILTERED], scale[LINE];
+    const float *restrict alpha = row_line(d, y, ALPHA_LINE) + x0;
+    const float *restrict importance = row_line(d, y, LEVEL_LINES + 3 * LEVELS - 1) + x0;
     for (int c = 0; c < MAX_FILTERED; c++)
         to[c] = filtered[c];
-    for (int y = first; y < last; y++)
-        for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
-            int n = mini(CHUNK, job->frame.width - x0);
-            const float *restrict alpha = row_line(d, y, ALPHA_LINE) + x0;
-            const float *restrict importance = row_line(d, y, LEVEL_LINES + 3 * LEVELS - 1) + x0;
-            filter_chunk(job, to, y, x0, n);
-            for (int i = 0; i < n; i++)
-                scale[i] = 1 / maxf(filtered[MASS][i], MIN_MASS);
-            for (int c = 0; c < filtered_channels(job); c++)
-                for (int i = 0; i < n; i++)
-                    filtered[c][i] *= scale[i];
-            for (int c = 0; c < RGB; c++) {
-                float *restrict output = row_line(d, y, OUTPUT_LINES + c) + x0;
-                for (int i = 0; i < n; i++) {
-                    float blended = output[i] + alpha[i] * (filtered[c][i] - output[i]);
-                    output[i] = importance[i] > NO_WEIGHT ? blended : 0;
-                }
-            }
-            for (int c = 0; c < RGB * job->frame.parts; c++)
-                finish_part(job, c / RGB, c % RGB, filtered[FILTERED + c], y, x0, n);
-            remember(job, y, x0, n);
+    filter_chunk(job, scratch, turn, to, y, x0, n);
+    for (int i = 0; i < n; i++)
+        scale[i] = 1 / maxf(filtered[MASS][i], MIN_MASS);
+    for (int c = 0; c < filtered_channels(job); c++)
+        for (int i = 0; i < n; i++)
+            filtered[c][i] *= scale[i];
+    for (int c = 0; c < RGB; c++) {
+        float *restrict output = row_line(d, y, OUTPUT_LINES + c) + x0;
+        for (int i = 0; i < n; i++) {
+            float blended = output[i] + alpha[i] * (filtered[c][i] - output[i]);
+            output[i] = importance[i] > NO_WEIGHT ? blended : 0;
         }
+    }
+    for (int c = 0; c < RGB * job->frame.parts; c++)
+        finish_part(job, c / RGB, c % RGB, filtered[FILTERED + c], y, x0, n);
+    remember(job, y, x0, n);
+}
+
+static void finish_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    filter_in_order(job, scratch, first, last, finish_chunk);
 }
 
 /* --- The filter, pass by pass ------------------------------------------------------------------------------------ */
@@ -2377,6 +2443,8 @@ static onespp *create(const onespp_config *config, void *memory, const Weights *
     /* There is no previous frame, whatever the memory held. */
     memset(d->own_history, 0, sizeof(Moment));
     memset(d->zeros, 0, sizeof(float) * (size_t)d->a.pitch);
+    /* Taps beside the image have no weight, but their distances must be finite. */
+    memset(d->distances, 0, sizeof(float) * 2 * DIRECTIONS * (size_t)d->config.tasks * (size_t)d->pitch);
     for (ptrdiff_t i = 0; i < d->pitch; i++)
         d->ones[i] = 1;
     float *to = d->parameters;
