@@ -19,7 +19,7 @@ from tabulate import tabulate
 from errors import BadInput
 from eval.metrics import METRICS, Values, mean_floor, means
 from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
-from eval.tables import PRINTED, ClipScores, TableRow, clip_rows, mean_rows, source_of_denoiser, value_cell
+from eval.tables import AGES, PRINTED, ClipScores, TableRow, clip_rows, mean_rows, source_of_denoiser, value_cell
 from eval.tradeoff.trades import Trade, psnr_front
 from files import read_json, write_file, write_json
 from provenance import ROOT, device_in_words
@@ -335,6 +335,32 @@ def steady(folder: str, *names: str) -> str:
     return table(lines)
 
 
+def lead(folder: str, denoiser: str, *peers: str) -> str:
+    """How far a denoiser is ahead of peers in the benchmark's means; its temporal error beside theirs."""
+    first_frame, *_ = AGES
+    clips, by_age = benchmark(folder)["clips"], benchmark(folder)["ages"]
+
+    def mean(metric: str, name: str) -> float:
+        return fmean(clip["results"][name][metric] for clip in clips)
+
+    def above_floor(name: str) -> float:
+        return mean("temporal_error", name) - mean("temporal_error", NOISE_FLOOR)
+
+    return table(
+        [
+            {
+                f"`{denoiser}` beside": f"`{peer}`",
+                first_frame: f"{by_age[denoiser][first_frame] - by_age[peer][first_frame]:+.2f} dB",
+                "steady frames": f"{mean('psnr', denoiser) - mean('psnr', peer):+.2f} dB",
+                "noise off": f"{float(noise_off(clips, denoiser)) - float(noise_off(clips, peer)):+.2f} dB",
+                "SSIM": f"{mean('ssim', denoiser) - mean('ssim', peer):+.4f}",
+                "temporal error above the floor": f"{100 * above_floor(denoiser) / above_floor(peer):.0f} %",
+            }
+            for peer in peers
+        ]
+    )
+
+
 def where(folder: str, *questions: str) -> str:
     """Shares of the pixels and of the squared error of the benchmark's clips, by what `onespp eval --where` asks."""
     lines = []
@@ -414,7 +440,7 @@ GENERATORS: dict[str, Callable[..., str]] = {
     f.__name__: f
     for f in (
         *(quality, times, milliseconds, metrics, samples, front, glass, stress, device, size, minutes),
-        *(ages, steady, where, rendering, forms),
+        *(ages, steady, lead, where, rendering, forms),
     )
 }
 

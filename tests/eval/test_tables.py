@@ -55,6 +55,18 @@ def test_noise_of_references_is_taken_off():
     assert noise_off(clips, NOISE_FLOOR) == ""
 
 
+def test_the_lead_over_a_peer(monkeypatch):
+    """Squared errors of 2 and 8 with noise of 1: 7 times less without it; temporal errors of 3 and 5 above 2."""
+    errors = {"one": (2, 3), "oidn": (8, 5), NOISE_FLOOR: (1, 2)}
+    scores = {
+        name: {"psnr": -10 * math.log10(e / 1e3), "temporal_error": t, "ssim": 1 / t} for name, (e, t) in errors.items()
+    }
+    ages = {"one": {"first frame": 27.0}, "oidn": {"first frame": 27.5}}
+    monkeypatch.setattr(pages, "benchmark", lambda _: {"clips": [{"results": scores}], "ages": ages})
+    row = pages.lead("", "one", "oidn").splitlines()[-1]
+    assert row.replace(" ", "") == "|`oidn`|-0.50dB|+6.02dB|+8.45dB|+0.1333|33%|"
+
+
 def test_what_has_no_time_is_named_below_the_front(monkeypatch):
     rows = [row | ({"ms": None} if row["denoiser"] == "one" else {}) for row in measured("trade")["samples"]]
     monkeypatch.setattr(pages, "measured", lambda _: {"samples": rows})
