@@ -30,6 +30,9 @@ def alone_in(folder: Path, fabric: Fabric) -> Iterator[None]:
     with locked(folder / ".lock") if fabric.is_global_zero else nullcontext(True) as ours:
         if not fabric.broadcast(ours):
             raise BadInput(f"another process is training in {folder}: wait for it or use another --runs")
+        if fabric.is_global_zero:
+            for half_written in folder.glob(".*.tmp"):  # by a training that was killed
+                half_written.unlink()
         yield
 
 

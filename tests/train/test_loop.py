@@ -28,7 +28,7 @@ from train.log import METRICS_CSV, Log, read_metrics, smooth
 from train.loop import alone_in, train_network
 from train.precision import BFLOAT16, FLOAT32
 from train.task import WEIGHTS_FILE
-from train.training import CHECKPOINT_FILE, Training
+from train.training import BEST_FILE, CHECKPOINT_FILE, Training
 
 # --- Interrupted, killed and finished ---------------------------------------------------------------------------------
 
@@ -125,6 +125,13 @@ def test_killed_training_ends_with_the_weights_of_an_undisturbed_one(tiny, tmp_p
 
 
 # --- Alone in a folder ------------------------------------------------------------------------------------------------
+
+
+def test_what_a_killed_training_has_half_written_is_removed(tiny, tmp_path, trained_copy):
+    half_written = trained_copy / f".{BEST_FILE}.1.tmp"
+    half_written.write_bytes(b"half")
+    train_network(short_task("rae", tiny, tmp_path, precision=None))
+    assert not half_written.exists()
 
 
 def test_the_checkpoint_of_a_training_at_work_is_not_read(tiny, tmp_path, trained_copy):
