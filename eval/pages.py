@@ -274,11 +274,19 @@ def mean_row(clips: Sequence[dict[str, Any]], denoiser: str) -> TableRow:
     return TableRow("mean", FLOOR if denoiser == NOISE_FLOOR else denoiser, "total", scores.means, scores.joint_floor)
 
 
-def noise_off(clips: Iterable[dict[str, Any]], denoiser: str) -> str:
-    """Mean PSNR of a denoiser over clips, in dB, of its squared error less that of the references' noise."""
+def psnr_noise_off(clips: Iterable[dict[str, Any]], denoiser: str) -> float | None:
+    """Mean PSNR of a denoiser over clips, in dB, of its squared error less that of the references' noise.
+
+    None where a clip's error is within that noise.
+    """
     pairs = [(clip["results"][denoiser]["psnr"], clip["results"][NOISE_FLOOR]["psnr"]) for clip in clips]
     own = [10 ** (-psnr / 10) - 10 ** (-floor / 10) for psnr, floor in pairs]
-    return f"{fmean(-10 * math.log10(error) for error in own):.2f}" if min(own) > 0 else ""
+    return fmean(-10 * math.log10(error) for error in own) if min(own) > 0 else None
+
+
+def noise_off(clips: Iterable[dict[str, Any]], denoiser: str) -> str:
+    psnr = psnr_noise_off(clips, denoiser)
+    return "" if psnr is None else f"{psnr:.2f}"
 
 
 def glass() -> str:
@@ -339,6 +347,11 @@ def lead(folder: str, denoiser: str, *peers: str) -> str:
     """How far a denoiser is ahead of peers in the benchmark's means; its temporal error beside theirs."""
     first_frame, *_ = AGES
     clips, by_age = benchmark(folder)["clips"], benchmark(folder)["ages"]
+    without_noise = {name: psnr_noise_off(clips, name) for name in (denoiser, *peers)}
+
+    def ahead_without_noise(peer: str) -> str:
+        own, other = without_noise[denoiser], without_noise[peer]
+        return "" if own is None or other is None else f"{own - other:+.2f} dB"
 
     def mean(metric: str, name: str) -> float:
         return fmean(clip["results"][name][metric] for clip in clips)
@@ -352,7 +365,7 @@ def lead(folder: str, denoiser: str, *peers: str) -> str:
                 f"`{denoiser}` beside": f"`{peer}`",
                 first_frame: f"{by_age[denoiser][first_frame] - by_age[peer][first_frame]:+.2f} dB",
                 "steady frames": f"{mean('psnr', denoiser) - mean('psnr', peer):+.2f} dB",
-                "noise off": f"{float(noise_off(clips, denoiser)) - float(noise_off(clips, peer)):+.2f} dB",
+                "noise off": ahead_without_noise(peer),
                 "SSIM": f"{mean('ssim', denoiser) - mean('ssim', peer):+.4f}",
                 "temporal error above the floor": f"{100 * above_floor(denoiser) / above_floor(peer):.0f} %",
             }

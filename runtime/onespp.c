@@ -443,6 +443,12 @@ static void *allocate(Arena *arena, uint64_t count, size_t size)
 
 static ptrdiff_t pitch_of(const onespp_config *config) { return PITCH(MARGIN + config->max_width + MARGIN); }
 
+/* Floats of the lines that distance_line returns. */
+static uint64_t count_distances(const onespp_config *config)
+{
+    return 2 * DIRECTIONS * (uint64_t)config->tasks * (uint64_t)pitch_of(config);
+}
+
 /* How many squares of that side an image has at most. */
 static uint64_t count_squares(const onespp_config *config, int side)
 {
@@ -538,8 +544,7 @@ static void lay_out(onespp *d, Arena *arena)
     d->comparisons = allocate(arena, tiles, sizeof(Comparison));
     d->residuals = allocate(arena, tiles, sizeof(Residual));
     d->depths = allocate(arena, MAX_DEPTHS, sizeof(float));
-    uint64_t lines = 2 * DIRECTIONS * (uint64_t)d->config.tasks;
-    d->distances = allocate(arena, lines * (uint64_t)d->pitch, sizeof(float));
+    d->distances = allocate(arena, count_distances(&d->config), sizeof(float));
     d->scratch = allocate(arena, (uint64_t)d->config.tasks, sizeof(Scratch));
     lay_out_layers(d, arena);
     lay_out_strip(d, arena);
@@ -2443,8 +2448,8 @@ static onespp *create(const onespp_config *config, void *memory, const Weights *
     /* There is no previous frame, whatever the memory held. */
     memset(d->own_history, 0, sizeof(Moment));
     memset(d->zeros, 0, sizeof(float) * (size_t)d->a.pitch);
-    /* Taps beside the image have no weight, but their distances must be finite. */
-    memset(d->distances, 0, sizeof(float) * 2 * DIRECTIONS * (size_t)d->config.tasks * (size_t)d->pitch);
+    /* Distances of taps beside the image are never measured, but read; such taps have no weight. */
+    memset(d->distances, 0, sizeof(float) * (size_t)count_distances(config));
     for (ptrdiff_t i = 0; i < d->pitch; i++)
         d->ones[i] = 1;
     float *to = d->parameters;
